@@ -270,10 +270,11 @@ class PhasedVectorEnv(BatchedEnv):
 
     def _end_phase(self, ending):
         """Terminal cost and bonus of the environments `ending`, whose phase ends here; returns their reward, (N,)."""
-        k = self._phase[self.t[ending] - 1]
-        radius, Qf, B = (np.array([getattr(p, name) for p in self.problem.phases])[k] for name in ("radius", "Qf", "bonus"))
-        scale = np.broadcast_to(self.radius_scale, len(self.problem.phases))[k]
-        error = np.hypot(*(xi[ending] - target for xi, target in zip(self.x, self._target[self.t[ending] - 1].T)))
+        last, phases = self.t[ending] - 1, self.problem.phases
+        k = self._phase[last]
+        radius, Qf, B = (np.array([getattr(phase, name) for phase in phases])[k] for name in ("radius", "Qf", "bonus"))
+        scale = np.broadcast_to(self.radius_scale, len(phases))[k]
+        error = np.hypot(self.x[0][ending] - self._target[last, 0], self.x[1][ending] - self._target[last, 1])
         self._terminal_error[ending, k] = error
         self._terminal_cost[ending] += Qf * error**2
         self._bonus[ending] += B * (error <= radius)
