@@ -90,7 +90,7 @@ DOUBLE_INTEGRATOR = Problem(
     f=double_integrator,
     u_max=4.0,
     phases=(Phase(steps=50, target=(0.0, 0.0), radius=0.05, R=0.1, Qf=20.0, bonus=20.0),),
-    x_max=(56.0, 21.0),  # |x2| <= 1 + u T, |x1| <= 1 + T + u T^2 / 2
+    x_max=(57.0, 22.0),  # |x2| <= 1 + u T, |x1| <= 1 + T + u T^2 / 2, and room for rounding
 )
 
 DOUBLE_INTEGRATOR_WAYPOINTS = Problem(
@@ -101,7 +101,7 @@ DOUBLE_INTEGRATOR_WAYPOINTS = Problem(
         Phase(steps=50, target=(0.0, 0.0), radius=0.02, R=0.1, Qf=20.0, bonus=20.0),
         Phase(steps=50, target=(0.5, 0.5), radius=0.02, R=0.1, Qf=30.0, bonus=20.0),
     ),
-    x_max=(161.0, 31.0),
+    x_max=(162.0, 32.0),
 )
 
 VAN_DER_POL = Problem(
@@ -139,7 +139,7 @@ TRANSITION_STEPS = 5  # the observed target moves from the old waypoint to the n
 class BatchedEnv(VectorEnv):
     """What every problem shares: step counters, checks of the action, and autoreset in the same step.
 
-    A problem gives the spaces (`single_observation_space`, `single_action_space`) and three methods:
+    A problem gives the spaces, `episode_steps` (the longest episode) and three methods:
     `_start(mask, options)` puts the environments in `mask` at a start, `_observe()` returns (N, obs) float64, and
     `_advance(actions)` flies one step and returns `(rewards (N,), terminated (N,), final)`, where `final()` gives the
     `final_info` arrays of the finished episodes; it is only called when there is one.
@@ -147,10 +147,10 @@ class BatchedEnv(VectorEnv):
 
     metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
 
-    def __init__(self, num_envs: int, single_observation_space: Box, single_action_space: Box):
+    def __init__(self, num_envs: int, episode_steps: int, single_observation_space: Box, single_action_space: Box):
         if num_envs < 1:
             raise ValueError(f"num_envs is {num_envs}; it must be at least 1")
-        self.num_envs = num_envs
+        self.num_envs, self.episode_steps = num_envs, episode_steps
         self.single_observation_space = single_observation_space
         self.single_action_space = single_action_space
         self.observation_space = batch_space(single_observation_space, num_envs)
@@ -214,7 +214,8 @@ class PhasedVectorEnv(BatchedEnv):
         low = -high
         low[-2 if multi_phase else -1 :] = 0.0
         u_max = np.array([problem.u_max])
-        super().__init__(num_envs, Box(low, high, dtype=np.float64), Box(-u_max, u_max, dtype=np.float64))
+        spaces = Box(low, high, dtype=np.float64), Box(-u_max, u_max, dtype=np.float64)
+        super().__init__(num_envs, problem.steps, *spaces)
         self._tabulate()
         self.x = (np.zeros(num_envs), np.zeros(num_envs))
         self._running_cost = np.zeros((2, num_envs))  # state and control part of the running episode's cost

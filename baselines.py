@@ -1,0 +1,421 @@
+"""Reference optima of the problems in `envs`: Riccati, box QP, and IPOPT, each flown once more by the environments.
+
+    python baselines.py double-integrator --starts 1000 --seed 0
+    python baselines.py van-der-pol --json van_der_pol.json --npz van_der_pol.npz
+    python baselines.py double-integrator-waypoints
+    python baselines.py van-der-pol-waypoints
+
+Each prints mean costs over random starts and what they are compared with. Reading order: linear-quadratic optimum,
+nonlinear programs, references, command line. CasADi is imported only where a nonlinear program is built.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from functools import cache
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+from scipy.optimize import lsq_linear
+
+from envs import DOUBLE_INTEGRATOR, PROBLEMS, VAN_DER_POL, Problem, fly, rk4
+
+STARTS_PER_PROCESS = 100  # fewer are solved sooner than another process has started
+REPLAY_TOLERANCE = 1e-8  # relative difference between the cost of a program's solution and of its flight
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Linear-quadratic optimum
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def linearise(problem: Problem):
+    """A (2, 2) and B (2, 1) of x_{k+1} = A x_k + B u_k about the origin, for the environment's own step.
+
+    Complex-step derivative (Squire and Trapp, SIAM Review 40, 1998): no difference is taken, so nothing cancels, and
+    a linear problem gives its exact discretisation.
+    """
+    h = 1e-20
+    columns = [rk4(problem.f, (1j * h * dx1, 1j * h * dx2), 1j * h * du, problem.dt) for dx1, dx2, du in np.eye(3)]
+    AB = np.imag(columns).T / h
+    return AB[:, :2], AB[:, 2:]
+
+
+def lqr(problem: Problem):
+    """Finite-horizon discrete LQR by the backward Riccati recursion (e.g. Anderson and Moore, Optimal Control, 1990).
+
+    Returns the gains K (T, 2) of u_t = -K_t x_t and P (T+1, 2, 2) with the cost to go x'P_t x. Exact for the double
+    integrator without its bound; for Van der Pol the linearisation about the origin. Raises ValueError on waypoints.
+    """
+    if len(problem.phases) != 1:
+        raise ValueError(f"{problem.env_id} has {len(problem.phases)} phases; LQR is for problems with 1")
+    (phase,) = problem.phases
+    A, B = linearise(problem)
+    Q, R, Qf = np.diag(phase.Q), phase.R, phase.Qf * np.eye(2)
+    K, P = np.empty((problem.steps, 2)), np.empty((problem.steps + 1, 2, 2))
+    P[-1] = Qf
+    for t in reversed(range(problem.steps)):
+        K[t] = np.linalg.solve(R + B.T @ P[t + 1] @ B, B.T @ P[t + 1] @ A)[0]
+        P[t] = Q + A.T @ P[t + 1] @ (A - B @ K[t : t + 1])
+    return K, P
+
+
+def lqr_policy(problem: Problem) -> Callable:
+    """LQR clipped at the control bound, as a policy for `envs.fly`."""
+    K, _ = lqr(problem)
+    return lambda obs, t: np.clip(-obs[:, :2] @ K[t], -problem.u_max, problem.u_max)[:, None]
+
+
+def box_qp(problem: Problem, x0):
+    """Optimal controls u (n, T) of the bounded double integrator from x0 (n, 2): the check of clipped LQR.
+
+    All states are written as x = Phi x0 + Gamma u (the condensed form of model predictive control, e.g. Rawlings and
+    Mayne), which leaves least squares in u within |u| <= u_max: solved by SciPy's active-set method BVLS.
+    """
+    (phase,), T = problem.phases, problem.steps
+    A, B = linearise(problem)
+    Phi, Gamma = np.zeros((T + 1, 2, 2)), np.zeros((T + 1, 2, T))
+    Phi[0] = np.eye(2)
+    for t in range(T):
+        Phi[t + 1], Gamma[t + 1] = A @ Phi[t], A @ Gamma[t]
+        Gamma[t + 1, :, t] = B[:, 0]
+    weight = np.sqrt(np.vstack([np.tile(phase.Q, (T, 1)), np.full((1, 2), phase.Qf)]))  # (T+1, 2)
+    states = (weight[:, :, None] * Gamma).reshape(-1, T)
+    offsets = (weight * (Phi @ np.asarray(x0, dtype=float)[:, None, :, None])[..., 0]).reshape(len(x0), -1)
+    system = np.vstack([states, np.sqrt(phase.R) * np.eye(T)])
+    bounds = (-problem.u_max, problem.u_max)
+    return np.array(
+        [lsq_linear(system, np.append(-b, np.zeros(T)), bounds, method="bvls", tol=1e-15).x for b in offsets]
+    )
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Nonlinear programs: states and held controls of every step are unknowns, the dynamics are constraints ("defects")
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def shooting(problem: Problem, x, u, x_next):
+    """Defect of multiple shooting, x_{k+1} - step(x_k, u_k), with the environment's own Runge-Kutta step."""
+    return tuple(b - a for a, b in zip(rk4(problem.f, x, u, problem.dt), x_next))
+
+
+def hermite_simpson(problem: Problem, x, u, x_next):
+    """Defect of direct collocation: a cubic through both ends that obeys x' = f(x, u) at mid-step, control held.
+
+    Hargraves and Paris (1987), in the compressed form of Betts, Practical Methods for Optimal Control, section 4.5.
+    """
+    f, dt = problem.f, problem.dt
+    dx, dx_next = f(x, u), f(x_next, u)
+    x_mid = tuple((a + b) / 2 + dt / 8 * (da - db) for a, b, da, db in zip(x, x_next, dx, dx_next))
+    dx_mid = f(x_mid, u)
+    return tuple(b - a - dt / 6 * (da + 4 * dm + db) for a, b, da, dm, db in zip(x, x_next, dx, dx_mid, dx_next))
+
+
+def program(problem: Problem, defect: Callable, in_circles: bool):
+    """The nonlinear program as CasADi symbols: unknowns u_0..u_{T-1}, x_1..x_T, parameter x_0.
+
+    Cost J = sum of dx'Q dx + R u^2 over the steps and Qf |dx|^2 at each phase's end (the paper's "J", by phases).
+    Constraints: the defects (2T of them, = 0); with `in_circles` also |dx|^2 / r^2 (<= 1) at each phase's end.
+    """
+    import casadi as ca
+
+    x0, u, x = ca.SX.sym("x0", 2), ca.SX.sym("u", problem.steps), ca.SX.sym("x", 2, problem.steps)
+    state, t, cost, defects, circles = (x0[0], x0[1]), 0, 0, [], []
+    for phase in problem.phases:
+        for _ in range(phase.steps):
+            state_next = (x[0, t], x[1, t])
+            cost += sum(q * (xi - target) ** 2 for q, xi, target in zip(phase.Q, state, phase.target))
+            cost += phase.R * u[t] ** 2
+            defects += defect(problem, state, u[t], state_next)
+            state, t = state_next, t + 1
+        distance2 = sum((xi - target) ** 2 for xi, target in zip(state, phase.target))
+        cost += phase.Qf * distance2
+        circles.append(distance2 / phase.radius**2)
+    constraints = ca.vertcat(*defects, *(circles if in_circles else ()))
+    return {"x": ca.vertcat(u, ca.vec(x)), "p": x0, "f": cost, "g": constraints}
+
+
+@cache
+def solver(env_id: str, defect: Callable, in_circles: bool):
+    """IPOPT for `program`, built once per process: its CasADi function and the arguments that no start changes.
+
+    Every start begins from the same guess, resting on the targets with no control, so that a solution depends neither
+    on its neighbours nor on how the starts are shared out.
+    """
+    import casadi as ca
+
+    problem = PROBLEMS[env_id]
+    options = {
+        "expand": True,
+        "print_time": False,
+        "ipopt.print_level": 0,
+        "ipopt.sb": "yes",
+        "ipopt.tol": 1e-10,
+        "ipopt.bound_relax_factor": 0,  # the default lets solutions end 2.5e-7 outside their circle
+    }
+    T, circles = problem.steps, len(problem.phases) if in_circles else 0
+    u_bound, x_free, dynamics = np.full(T, problem.u_max), np.full(2 * T, np.inf), np.zeros(2 * T)
+    at_targets = [target for phase in problem.phases for _ in range(phase.steps) for target in phase.target]
+    arguments = {
+        "x0": np.append(np.zeros(T), at_targets),
+        "lbx": np.append(-u_bound, -x_free),
+        "ubx": np.append(u_bound, x_free),
+        "lbg": np.append(dynamics, np.full(circles, -np.inf)),
+        "ubg": np.append(dynamics, np.ones(circles)),
+    }
+    return ca.nlpsol("optimum", "ipopt", program(problem, defect, in_circles), options), arguments
+
+
+def _solve_start(task):
+    """Solve one start: `(u (T,), cost, feasible)`. A task holds all it needs, so that any process can take it."""
+    env_id, defect, in_circles, index, x0 = task
+    solve, arguments = solver(env_id, defect, in_circles)
+    solution = solve(p=x0, **arguments)
+    status = solve.stats()["return_status"]
+    feasible = status == "Solve_Succeeded"
+    # only the circles can be out of reach: without them every control has its trajectory
+    if not feasible and not (in_circles and status == "Infeasible_Problem_Detected"):
+        raise RuntimeError(f"start {index}, x0 = {x0.tolist()}, of {env_id}: IPOPT stopped with {status}")
+    return solution["x"].full()[: PROBLEMS[env_id].steps, 0], float(solution["f"]), feasible
+
+
+def optimise(env_id: str, x0, defect: Callable = shooting, in_circles: bool = False, processes: int | None = None):
+    """Solve `program` from each start x0 (n, 2): controls u (n, T), costs (n,) and whether a solution exists (n,).
+
+    Where none exists (`in_circles` only) u and cost are IPOPT's last ones and mean nothing. Any other failure is a
+    RuntimeError that names the start. `processes` (default: by the number of starts and cores) changes only the time;
+    they are spawned, which is safe beside the threads of other libraries.
+    """
+    if processes is None:
+        processes = max(1, min(os.cpu_count() or 1, len(x0) // STARTS_PER_PROCESS))
+    tasks = [(env_id, defect, in_circles, index, start) for index, start in enumerate(x0)]
+    if processes == 1:
+        solutions = [_solve_start(task) for task in tasks]
+    else:
+        chunk = -(-len(tasks) // (4 * processes))
+        with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
+            solutions = list(pool.map(_solve_start, tasks, chunksize=chunk))
+    u, cost, feasible = zip(*solutions)
+    return np.array(u), np.array(cost), np.array(feasible)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# References: optima flown by the environments
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def replay(env_id: str, x0, u, cost):
+    """Fly the controls u (n, T) from x0 (n, 2): what `envs.fly` returns, and `replay_error` (n,).
+
+    That is the relative difference between the program's `cost` (n,) and the flight's. Raises RuntimeError, naming the
+    start, above `REPLAY_TOLERANCE`: then the program is not the environment's problem.
+    """
+    flight = fly(env_id, lambda obs, t: u[:, t, None], x0)
+    # a cost below 1e-4 (a start within 0.003 of the origin) is compared absolutely: IPOPT has a tolerance too
+    error = np.abs(cost - flight["cost"]) / np.maximum(flight["cost"], 1e-4)
+    worst = int(np.argmax(error))
+    if not error[worst] <= REPLAY_TOLERANCE:
+        raise RuntimeError(
+            f"start {worst}, x0 = {x0[worst].tolist()}, of {env_id}: its optimum costs {cost[worst]} in the program "
+            f"and {flight['cost'][worst]} in the environment; at most {REPLAY_TOLERANCE:g} (relative) is allowed"
+        )
+    return {**flight, "replay_error": error}
+
+
+def reference(env_id: str, x0, processes: int | None = None) -> dict:
+    """The optimum from each start x0 (n, 2), flown by the environment: the arrays of `envs.fly`, from these methods.
+
+    DoubleIntegrator-v0: LQR clipped at the bound, which is the bounded optimum from the start box (`box_qp` agrees).
+    VanDerPol-v0: multiple shooting, with `replay_error` (n,). Waypoints: see `waypoint_reference`.
+    Raises ValueError on an unknown id, a bad x0 or number of processes, RuntimeError where a solve or replay fails.
+    """
+    x0 = np.asarray(x0, dtype=np.float64)
+    if env_id not in PROBLEMS:
+        raise ValueError(f"env_id is {env_id!r}; it must be one of {', '.join(PROBLEMS)}")
+    if x0.ndim != 2 or x0.shape[1] != 2 or len(x0) == 0 or not np.isfinite(x0).all():
+        raise ValueError(f"x0 must be finite, of shape (n, 2) with n >= 1; got {x0.tolist()!r:.80}")
+    if processes is not None and processes < 1:
+        raise ValueError(f"processes is {processes}; it must be at least 1")
+    if env_id == DOUBLE_INTEGRATOR.env_id:
+        return fly(env_id, lqr_policy(DOUBLE_INTEGRATOR), x0)
+    if env_id == VAN_DER_POL.env_id:
+        u, cost, _ = optimise(env_id, x0, processes=processes)
+        return replay(env_id, x0, u, cost)
+    return waypoint_reference(env_id, x0, processes)
+
+
+def waypoint_reference(env_id: str, x0, processes: int | None = None) -> dict:
+    """The better, bonuses counted, of the optima with and without |x - target| <= r at every phase's end.
+
+    Beside `replay`'s arrays: `constrained` (n,), whether it is the one with the circles; `infeasible` (n,), whether no
+    control reaches all circles (then it is the one without); and `cost_free` (n,), `terminal_error_free` (n, phases)
+    of the optimum without. Raises RuntimeError where an optimum with the circles misses one in flight.
+    """
+    u_free, cost_free, _ = optimise(env_id, x0, processes=processes)
+    u, cost, feasible = optimise(env_id, x0, in_circles=True, processes=processes)
+    free = replay(env_id, x0, u_free, cost_free)
+    circled = replay(env_id, x0, np.where(feasible[:, None], u, u_free), np.where(feasible, cost, cost_free))
+    missed = feasible & ~circled["hit"].all(axis=1)
+    if missed.any():
+        start = int(np.argmax(missed))
+        distances = circled["terminal_error"][start].tolist()
+        raise RuntimeError(f"start {start}, x0 = {x0[start].tolist()}, of {env_id} misses its circles: {distances}")
+    constrained = circled["episodic_return"] > free["episodic_return"]
+    best = {key: free[key].copy() for key in free}
+    for key, values in best.items():
+        values[constrained] = circled[key][constrained]
+    compared = {"cost_free": free["cost"], "terminal_error_free": free["terminal_error"]}
+    return {**best, "constrained": constrained, "infeasible": ~feasible, **compared}
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Command line
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def summarise(flight: dict) -> dict:
+    """What every problem's table begins with: means over the starts of a flight, flat and ready for JSON."""
+    parts = ("cost", "cost_state", "cost_control", "cost_terminal")
+    numbers = {f"{key}_mean": flight[key].mean() for key in parts}
+    numbers |= {"episodic_return_mean": flight["episodic_return"].mean(), "hit_rate": flight["hit"].all(axis=1).mean()}
+    if flight["hit"].shape[1] > 1:
+        numbers |= {f"hit_rate_phase_{k}": rate for k, rate in enumerate(flight["hit"].mean(axis=0), start=1)}
+    numbers |= {"terminal_error_max": flight["terminal_error"].max(), "control_max": np.abs(flight["u"]).max()}
+    if "replay_error" in flight:
+        numbers["replay_error_max"] = flight["replay_error"].max()
+    return numbers
+
+
+def compare_double_integrator(env_id: str, x0, flight: dict) -> dict:
+    """Riccati's K_0 and P_0, and clipped LQR against unbounded LQR (cost x'P_0 x) and against the box QP."""
+    K, P = lqr(PROBLEMS[env_id])
+    unbounded = np.einsum("ni,ij,nj->n", x0, P[0], x0)
+    saturated = (np.abs(np.einsum("tj,ntj->nt", K, flight["x"][:, :-1])) > PROBLEMS[env_id].u_max).any(axis=1)
+    u_qp = box_qp(PROBLEMS[env_id], x0)
+    qp = fly(env_id, lambda obs, t: u_qp[:, t, None], x0)
+    ratio = flight["cost"] / unbounded
+    numbers = {"K0_1": K[0, 0], "K0_2": K[0, 1], "P0_11": P[0, 0, 0], "P0_12": P[0, 0, 1], "P0_22": P[0, 1, 1]}
+    numbers |= {"expected_cost_unbounded": np.trace(P[0]) / 3, "saturated_share": saturated.mean()}
+    numbers |= {"ratio_to_unbounded_mean": ratio.mean(), "ratio_to_unbounded_max": ratio.max()}
+    return numbers | {"box_qp_error_max": np.abs(flight["cost"] / qp["cost"] - 1).max()}
+
+
+def compare_van_der_pol(env_id: str, x0, flight: dict) -> dict:
+    """The paper's other references: direct collocation (as solved, and flown) and LQR about the origin."""
+    u, cost, _ = optimise(env_id, x0, hermite_simpson)
+    collocated = fly(env_id, lambda obs, t: u[:, t, None], x0)["cost"]
+    linear = fly(env_id, lqr_policy(PROBLEMS[env_id]), x0)["cost"]
+    numbers = {}
+    for name, other in (("collocation", cost), ("collocation_flown", collocated), ("lqr", linear)):
+        numbers |= {f"{name}_cost_mean": other.mean(), f"{name}_ratio_of_sums": other.sum() / flight["cost"].sum()}
+    return numbers
+
+
+def compare_waypoints(env_id: str, x0, flight: dict) -> dict:
+    """The optimum without circles beside the reference, and what hitting the circles costs and wins."""
+    numbers = {"constrained_share": flight["constrained"].mean(), "infeasible_starts": int(flight["infeasible"].sum())}
+    numbers["cost_free_mean"] = flight["cost_free"].mean()
+    numbers["extra_cost_mean"] = (flight["cost"] - flight["cost_free"]).mean()
+    numbers["extra_cost_max"] = (flight["cost"] - flight["cost_free"]).max()
+    bonus = np.array([phase.bonus for phase in PROBLEMS[env_id].phases])
+    radius = np.array([phase.radius for phase in PROBLEMS[env_id].phases])
+    hit_free = flight["terminal_error_free"] <= radius
+    numbers["bonus_won_mean"] = ((flight["hit"].astype(int) - hit_free) @ bonus).mean()
+    for name, key in (("distance_free", "terminal_error_free"), ("distance", "terminal_error")):
+        numbers |= {f"{name}_phase_{k}": mean for k, mean in enumerate(flight[key].mean(axis=0), start=1)}
+    return numbers
+
+
+COMMANDS = {
+    "double-integrator": ("DoubleIntegrator-v0", compare_double_integrator),
+    "van-der-pol": ("VanDerPol-v0", compare_van_der_pol),
+    "double-integrator-waypoints": ("DoubleIntegratorWaypoints-v0", compare_waypoints),
+    "van-der-pol-waypoints": ("VanDerPolWaypoints-v0", compare_waypoints),
+}
+
+
+def report(args) -> None:
+    """Solve, print the table, and write the files asked for: the numbers as JSON, the trajectories as npz."""
+    env_id, compare = COMMANDS[args.command]
+    x0 = np.random.default_rng(args.seed).uniform(-1, 1, (args.starts, 2))
+    begin = time.perf_counter()
+    flight = reference(env_id, x0)
+    numbers = {"env_id": env_id, "starts": args.starts, "seed": args.seed, "solve_seconds": time.perf_counter() - begin}
+    numbers |= summarise(flight) | compare(env_id, x0, flight)
+    for key, value in numbers.items():
+        print(f"{key:<32}{value if isinstance(value, str) else format(value, '.7g')}")
+    if args.json:
+        write(args.json, lambda file: file.write(json.dumps(numbers, indent=1).encode()))
+    if args.npz:
+        arrays = {f"{key}_reference": flight[key] for key in ("x", "u", "cost")}
+        write(args.npz, lambda file: np.savez(file, t=PROBLEMS[env_id].dt * np.arange(flight["x"].shape[1]), **arrays))
+
+
+def write(path: Path, fill: Callable) -> None:
+    """Let `fill(file)` write a binary file under a temporary name, then rename it: `path` is whole or untouched."""
+    temporary = path.with_name(f"{path.name}.tmp")
+    try:
+        with temporary.open("wb") as file:
+            fill(file)
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+class OneLineParser(argparse.ArgumentParser):
+    """Errors are one line, without the usage above it."""
+
+    def error(self, message):
+        sys.exit(f"error: {message}")
+
+
+def integer(low: int, high: int) -> Callable:
+    """Argument type: a whole number from `low` to `high`."""
+
+    def parse(text):
+        if not text.isdecimal() or not low <= int(text) <= high:
+            raise argparse.ArgumentTypeError(f"{text!r} must be a whole number from {low} to {high}")
+        return int(text)
+
+    return parse
+
+
+def output(text: str) -> Path:
+    """Argument type: a file to write, refused before anything is solved if that cannot work."""
+    path = Path(text)
+    if path.is_dir() or not os.access(path.parent, os.W_OK):
+        raise argparse.ArgumentTypeError(f"{text!r} must be a file in an existing, writable folder")
+    return path
+
+
+def parse_args(argv=None):
+    """One sub-command per problem; each sets `run`, the function that the main part calls with the arguments."""
+    parser = OneLineParser(description=__doc__.splitlines()[0])
+    commands = parser.add_subparsers(dest="command", required=True)
+    for name, (env_id, _) in COMMANDS.items():
+        command = commands.add_parser(name, help=f"optima of {env_id}")
+        command.add_argument("--starts", type=integer(1, 100_000), default=1000, metavar="N", help="default 1000")
+        command.add_argument("--seed", type=integer(0, 2**32 - 1), default=0, metavar="S", help="default 0")
+        command.add_argument("--json", type=output, metavar="F", help="write the numbers to this file")
+        command.add_argument("--npz", type=output, metavar="F", help="write the trajectories to this file")
+        command.set_defaults(run=report)
+    return parser.parse_args(argv)
+
+
+def main() -> None:
+    """Run the sub-command; what can go wrong in it ends in one line."""
+    args = parse_args()
+    try:
+        args.run(args)
+    except (ImportError, OSError, RuntimeError) as error:
+        sys.exit(f"error: {error}")
+
+
+if __name__ == "__main__":
+    main()

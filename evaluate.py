@@ -1,0 +1,581 @@
+"""A policy against the optimum: cases, ratios, table, figures, results folders. Needs no torch, imports no script.
+
+    python evaluate.py publish RUN_DIR results/di     # add a run to a results folder (--ship: make it the shipped one)
+    python evaluate.py figures results/di             # redraw its figures and print its table (a run folder works too)
+
+Reading order: cases and ratios, table, files, training curves, figures, results folders, command line. The names of all
+metrics (`eval.json`) and arrays (`eval.npz`) are the project's interface. Costs are the paper's J: plain sums, no unit.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import hashlib
+import json
+import math
+import os
+import sys
+import zipfile
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import safetensors.numpy
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle
+from matplotlib.ticker import EngFormatter
+
+import baselines
+import envs
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Cases and ratios
+# ---------------------------------------------------------------------------------------------------------------------
+
+PAPER_STARTS, PAPER_DRAWS = 10, 100  # the paper reports the mean ratio of ten starts; we draw such tens a hundred times
+
+
+def starts(seed: int, n: int) -> np.ndarray:
+    """The n evaluation starts (n, 2) of a seed: uniform in the paper's "state bounds", [-1, 1] in each component."""
+    return np.random.default_rng(seed).uniform(-1, 1, (n, 2))
+
+
+def evaluate(env_id, policy, eval_seed: int, n: int, reference: dict | None = None, **env_options):
+    """Fly `policy(obs (n, obs), t) -> action (n, 1)` from n starts and compare it, start by start, with the optimum.
+
+    `reference` is `baselines.reference(env_id, starts(eval_seed, n))`, solved here when it is not given; `env_options`
+    go to the environment. Returns the `metrics` of eval.json that do not depend on the run, as plain numbers, and the
+    `arrays` of eval.npz. Raises ValueError if the reference belongs to other starts.
+    """
+    x0 = starts(eval_seed, n)
+    flight = envs.fly(env_id, policy, x0, **env_options)
+    reference = baselines.reference(env_id, x0) if reference is None else reference
+    if not np.array_equal(reference["x"][:, 0], x0):
+        raise ValueError(f"reference does not belong to the {n} starts of eval_seed {eval_seed}")
+    metrics = {"env_id": env_id, "eval_seed": eval_seed, "eval_starts": n}
+    metrics |= flight_metrics(flight, reference)
+    chosen = comparable(env_id, flight["x"], reference["x"])
+    metrics |= ratio_metrics(flight["cost"][chosen], reference["cost"][chosen], eval_seed)
+    problem = envs.PROBLEMS[env_id]
+    arrays = {"t": problem.dt * np.arange(problem.steps + 1)}
+    arrays |= {key: flight[key] for key in ("x", "u", "reward", "cost")}
+    arrays |= {f"{key}_reference": reference[key] for key in ("x", "u", "cost")}
+    return metrics, arrays
+
+
+def flight_metrics(flight: dict, reference: dict) -> dict:
+    """Means over all starts of what was flown and of the optimum, and the shares of starts that hit their circles."""
+    metrics = {}
+    for prefix, result in (("", flight), ("reference_", reference)):
+        metrics[f"{prefix}episodic_return"] = float(result["episodic_return"].mean())
+        for part in ("cost", "cost_state", "cost_control", "cost_terminal"):
+            metrics[f"{prefix}{part}_mean"] = float(result[part].mean())
+        metrics[f"{prefix}hit_rate"] = float(result["hit"].all(axis=1).mean())
+    for k, rate in enumerate(flight["hit"].mean(axis=0), start=1):
+        metrics[f"hit_rate_phase_{k}"] = float(rate)
+    metrics["terminal_error_max"] = float(flight["terminal_error"].max())
+    return metrics
+
+
+def hits_every_circle(env_id: str, x: np.ndarray) -> np.ndarray:
+    """Whether flights x (n, T+1, 2) are within the target's radius at the end of every phase; (n,) bool."""
+    phases = envs.PROBLEMS[env_id].phases
+    ends = np.cumsum([phase.steps for phase in phases])
+    d = x[:, ends] - [phase.target for phase in phases]  # (n, phases, 2)
+    # hypot, as in the environment: the optimum is on the circle's edge, where another rounding would decide otherwise
+    return (np.hypot(d[..., 0], d[..., 1]) <= [phase.radius for phase in phases]).all(axis=1)
+
+
+def comparable(env_id: str, x: np.ndarray, x_reference: np.ndarray) -> np.ndarray:
+    """The starts (n,) whose costs may be compared: all, or with waypoints those where both sides hit every circle.
+
+    Skipping a circle is cheaper than hitting it, so that a miss would count as better than the optimum. An optimum that
+    hits every circle is the radius-constrained one, also where the constraint did not have to be imposed.
+    """
+    if len(envs.PROBLEMS[env_id].phases) == 1:
+        return np.ones(len(x), dtype=bool)
+    return hits_every_circle(env_id, x) & hits_every_circle(env_id, x_reference)
+
+
+def ratio_metrics(cost: np.ndarray, reference_cost: np.ndarray, eval_seed: int) -> dict:
+    """Statistics of the cost ratios ours / optimum of the comparable starts, both (m,); without a start, no key."""
+    if len(cost) == 0:
+        return {}
+    ratio = cost / reference_cost
+    metrics = {"ratio_of_sums": cost.sum() / reference_cost.sum(), "ratio_mean": ratio.mean()}
+    metrics |= {"ratio_median": np.median(ratio), "ratio_p95": np.percentile(ratio, 95)}
+    metrics |= {"ratio_min": ratio.min(), "ratio_max": ratio.max()}
+    if len(ratio) >= PAPER_STARTS:
+        rng = np.random.default_rng([eval_seed, 1])  # not the stream that drew the starts
+        means = [rng.choice(ratio, PAPER_STARTS, replace=False).mean() for _ in range(PAPER_DRAWS)]
+        for percentile in (50, 95):
+            metrics[f"ten_start_ratio_mean_p{percentile}"] = np.percentile(means, percentile)
+    return {key: float(value) for key, value in metrics.items()}
+
+
+def cost_parts(env_id: str, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """State, control and terminal part (n, 3) of the cost J of flights x (n, T+1, 2), u (n, T) (the paper's Eq. of J).
+
+    eval.npz holds the flights and their total cost; the figures take its parts from here.
+    """
+    parts, start = np.zeros((len(x), 3)), 0
+    for phase in envs.PROBLEMS[env_id].phases:
+        d = x[:, start : start + phase.steps + 1] - phase.target
+        parts[:, 0] += (d[:, :-1] ** 2 @ phase.Q).sum(axis=1)  # the state before each step
+        parts[:, 1] += phase.R * (u[:, start : start + phase.steps] ** 2).sum(axis=1)
+        parts[:, 2] += phase.Qf * (d[:, -1] ** 2).sum(axis=1)
+        start += phase.steps
+    return parts
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Table
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def table(metrics: dict) -> str:
+    """The table "optimum | ours | ratio" of an evaluation, to be read in a terminal.
+
+    The means are over all starts. Where some miss a circle, the ratio of J is over the others and its parts have none.
+    """
+    phases = envs.PROBLEMS[metrics["env_id"]].phases
+    all_compared = len(phases) == 1 or metrics["hit_rate"] == metrics["reference_hit_rate"] == 1
+    rows = [("", "optimum", "ours", "ratio")]
+    labels = {"cost": f"cost J (mean of {metrics['eval_starts']} starts)", "cost_state": "  of it: state"}
+    labels |= {"cost_control": "  of it: control", "cost_terminal": "  of it: terminal"}
+    for part, label in labels.items():
+        optimum, ours = metrics[f"reference_{part}_mean"], metrics[f"{part}_mean"]
+        ratio = metrics.get("ratio_of_sums") if part == "cost" else ours / optimum if all_compared and optimum else None
+        rows.append((label, f"{optimum:.4f}", f"{ours:.4f}", f"{ratio:.4f}" if ratio is not None else "-"))
+    optimum, ours = metrics["reference_episodic_return"], metrics["episodic_return"]
+    rows.append(("reward (bonus - J, mean)", f"{optimum:.4f}", f"{ours:.4f}", "-"))
+    label = "starts that hit the target circle" if len(phases) == 1 else "starts that hit every circle"
+    rows.append((label, f"{metrics['reference_hit_rate']:.1%}", f"{metrics['hit_rate']:.1%}", "-"))
+    for k, phase in enumerate(phases if len(phases) > 1 else (), start=1):
+        label = f"  circle {k}: {phase.target}, radius {phase.radius}"
+        rows.append((label, "", f"{metrics[f'hit_rate_phase_{k}']:.1%}", ""))
+    width = max(len(row[0]) for row in rows)
+    lines = [f"{metrics['env_id']}: {metrics['eval_starts']} starts of eval seed {metrics['eval_seed']}"]
+    lines += [(f"  {row[0]:<{width}}" + "".join(f"{cell:>11}" for cell in row[1:])).rstrip() for row in rows]
+    return "\n".join([*lines, *ratio_lines(metrics)])
+
+
+def ratio_lines(metrics: dict) -> list[str]:
+    """The lines below the table: the statistics of the cost ratio, or why there is none."""
+    waypoints = len(envs.PROBLEMS[metrics["env_id"]].phases) > 1
+    if "ratio_of_sums" not in metrics:
+        reason = "no start hit every circle" if metrics["hit_rate"] == 0 else "where ours hit, the optimum does not"
+        return [f"  No cost ratio: {reason} (missing a circle is cheaper, not better)."]
+    over = "the starts that hit every circle" if waypoints else f"all {metrics['eval_starts']} starts"
+    statistics = ", ".join(f"{s} {metrics[f'ratio_{s}']:.4f}" for s in ("mean", "median", "p95", "min", "max"))
+    lines = [f"  Cost ratio ours / optimum over {over}:", f"    ratio of sums {metrics['ratio_of_sums']:.4f}"]
+    lines.append(f"    start by start: {statistics}")
+    if "ten_start_ratio_mean_p50" in metrics:
+        p50, p95 = (metrics[f"ten_start_ratio_mean_p{p}"] for p in (50, 95))
+        draws = f"mean of {PAPER_STARTS} starts (the paper's number), {PAPER_DRAWS} draws"
+        lines.append(f"    {draws}: median {p50:.4f}, p95 {p95:.4f}")
+    return lines
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Files: each is written beside its place and renamed, so that a failure leaves the old one
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+class BadInput(ValueError):
+    """A file or value that a user gave and nothing can be done with; its message is the one line that is shown."""
+
+
+@contextmanager
+def replacing(path, mode: str = "wb"):
+    """Open a temporary file that becomes `path` when the block ends without an error. Raises OSError."""
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with open(temporary, mode, newline=None if "b" in mode else "") as file:
+            yield file
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_bytes(path, data: bytes):
+    """Write a whole file."""
+    with replacing(path) as file:
+        file.write(data)
+
+
+def write_json(path, metrics: dict):
+    """Write metrics as flat JSON in the given order; ValueError names a key that is not finite."""
+    plain = {key: value.item() if isinstance(value, np.generic) else value for key, value in metrics.items()}
+    for key, value in plain.items():
+        if isinstance(value, float) and not math.isfinite(value):
+            raise ValueError(f"{key} is {value}; eval.json holds finite numbers only")
+    write_bytes(path, (json.dumps(plain, indent=2) + "\n").encode())
+
+
+def write_npz(path, arrays: dict):
+    """Write arrays as a compressed .npz."""
+    with replacing(path) as file:
+        np.savez_compressed(file, **arrays)
+
+
+def write(metrics: dict, arrays: dict, checkpoint, json_path, npz_path):
+    """Write an evaluation of the file `checkpoint`, which `metrics` then names by its sha256; None writes nothing."""
+    metrics["checkpoint_sha256"] = hashlib.sha256(Path(checkpoint).read_bytes()).hexdigest()
+    if json_path is not None:
+        write_json(json_path, metrics)
+    if npz_path is not None:
+        write_npz(npz_path, arrays)
+
+
+def read_checkpoint(path, expected: dict[str, type]) -> dict:
+    """An agent.safetensors: `args` (the run's arguments), `progress` (its counters), `tensors` (NumPy arrays).
+
+    `expected` gives the type of each argument that must be there. Raises BadInput if the file is missing, damaged or
+    of something else, or holds a weight that is not finite.
+    """
+    try:
+        data = Path(path).read_bytes()
+        tensors = safetensors.numpy.load(data)
+        metadata = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])["__metadata__"]
+        args = json.loads(metadata["args"])
+        wrong = [name for name, kind in expected.items() if type(args[name]) is not kind]
+        counters = {"seed": int, "total_updates": int, "global_step": int, "wall_seconds": float}
+        progress = {name: kind(metadata[name]) for name, kind in counters.items()}
+    except OSError as error:
+        raise BadInput(f"--checkpoint {path}: {error.strerror}; it must be an agent.safetensors") from error
+    except (safetensors.SafetensorError, KeyError, TypeError, ValueError) as error:
+        raise BadInput(f"--checkpoint {path}: damaged or foreign ({error}); it must be an agent.safetensors") from error
+    if wrong:
+        name = wrong[0]
+        raise BadInput(f"--checkpoint {path}: its {name} is {args[name]!r}; must be {expected[name].__name__}")
+    if not all(np.isfinite(tensor).all() for tensor in tensors.values()):
+        raise BadInput(f"--checkpoint {path}: holds a NaN or an infinity; its weights must be finite")
+    return {"args": args, "progress": progress, "tensors": tensors}
+
+
+def read_evaluation(folder: Path) -> tuple[dict, dict]:
+    """The `metrics` and `arrays` of a run's or results folder; OSError or ValueError names the file that is bad."""
+    metrics = read_json(folder / "eval.json")
+    path = folder / "eval.npz"
+    try:
+        with np.load(path) as file:
+            arrays = {key: file[key] for key in file.files}
+    except (ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{path} is not a readable .npz: {error}") from error
+    needed = {"t", "x", "u", "reward", "cost", "x_reference", "u_reference", "cost_reference"}
+    if missing := needed - arrays.keys():
+        raise ValueError(f"{path} lacks {', '.join(sorted(missing))}")
+    return metrics, arrays
+
+
+def read_json(path: Path) -> dict:
+    """The eval.json of a finished run; ValueError names the file and what is wrong with it."""
+    try:
+        metrics = json.loads(path.read_text())
+    except ValueError as error:
+        raise ValueError(f"{path} is not readable JSON: {error}") from error
+    if not isinstance(metrics, dict) or metrics.get("env_id") not in envs.PROBLEMS:
+        raise ValueError(f"{path}: env_id must be one of {', '.join(envs.PROBLEMS)}")
+    if not isinstance(metrics.get("seed"), int):
+        raise ValueError(f"{path}: seed is {metrics.get('seed')!r}; it must be an integer")
+    return metrics
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Training curves: {TensorBoard tag: (global steps (k,), values (k,))}
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def read_curve(run_dir) -> dict:
+    """The curve of a run from its TensorBoard events; a resumed run repeats steps, and the last value counts."""
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(run_dir), size_guidance={"scalars": 0})
+    events.Reload()
+    curve = {}
+    for tag in events.Tags()["scalars"]:
+        values = {event.step: event.value for event in events.Scalars(tag)}
+        steps = sorted(values)
+        curve[tag] = np.array(steps), np.array([values[step] for step in steps])
+    return curve
+
+
+def write_csv(path, curve: dict):
+    """Write a curve: `global_step`, then one column a tag; an empty cell where a tag has no value at that step."""
+    columns = {tag: dict(zip(steps.tolist(), values.tolist())) for tag, (steps, values) in curve.items()}
+    with replacing(path, "w") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["global_step", *columns])
+        for step in sorted(set().union(*columns.values())):
+            # TensorBoard keeps float32, which nine digits give back exactly
+            cells = (f"{column[step]:.9g}" if step in column else "" for column in columns.values())
+            writer.writerow([step, *cells])
+
+
+def read_csv(path) -> dict:
+    """The curve that `write_csv` wrote; ValueError if the file is not such a table."""
+    with open(path, newline="") as file:
+        header, *rows = list(csv.reader(file)) or [[]]
+    if header[:1] != ["global_step"] or any(len(row) != len(header) for row in rows):
+        raise ValueError(f"{path} is not a training curve: global_step, then one column a TensorBoard tag")
+    curve = {}
+    for column, tag in enumerate(header[1:], start=1):
+        filled = [row for row in rows if row[column]]
+        curve[tag] = np.array([int(row[0]) for row in filled]), np.array([float(row[column]) for row in filled])
+    return curve
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Figures: the paper's (policy red, optimum blue, target green). It gives time in s, and x, u and J no unit
+# ---------------------------------------------------------------------------------------------------------------------
+
+SHOWN = 10  # the paper shows ten starts
+# the optimum is drawn last and dashed: both lines are seen where they coincide, also without telling red from blue
+POLICY = {"color": "tab:red", "linewidth": 1.6, "linestyle": "-"}
+OPTIMUM = {"color": "tab:blue", "linewidth": 1.0, "linestyle": (0, (4, 2))}
+TARGET = {"color": "tab:green", "linewidth": 1.5}
+BOUNDARY = {"color": "0.5", "linewidth": 0.8, "linestyle": ":"}
+
+
+def figures(folder, arrays: dict, metrics: dict, curve: dict | None = None, others=()) -> list[Path]:
+    """Draw trajectories.png, costs.png and, given the run's training curve, training.png into `folder`.
+
+    `arrays` and `metrics` are those of `evaluate`; `others` are the training curves of other seeds. Returns the paths.
+    """
+    drawn = {} if curve is None else {"training.png": draw_training([curve, *others], metrics)}
+    drawn |= {"trajectories.png": draw_trajectories(arrays, metrics), "costs.png": draw_costs(arrays, metrics)}
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, figure in drawn.items():
+        with replacing(folder / name) as file:
+            figure.savefig(file, format="png", dpi=130)
+    return [folder / name for name in drawn]
+
+
+def headline(metrics: dict) -> str:
+    """A figure's title: the problem and how close to the optimum the policy flies."""
+    if "ratio_of_sums" not in metrics:
+        return f"{metrics['env_id']}: no cost ratio, {metrics['hit_rate']:.1%} of the starts hit every circle"
+    title = f"{metrics['env_id']}: cost {metrics['ratio_of_sums']:.4f} x optimum"
+    if len(envs.PROBLEMS[metrics["env_id"]].phases) == 1:
+        return f"{title} ({metrics['eval_starts']} starts)"
+    return f"{title} over the starts that hit every circle ({metrics['hit_rate']:.1%})"
+
+
+def draw_training(curves: list[dict], metrics: dict) -> Figure:
+    """Reward, policy loss and total loss over the samples; with several seeds each thin and their median thick."""
+    figure = Figure(figsize=(12, 3.8), layout="constrained")
+    seeds = f", {len(curves)} seeds" if len(curves) > 1 else ""
+    figure.suptitle(f"{headline(metrics)}{seeds}")
+    panels = {"charts/episodic_return": "episodic return", "losses/policy_loss": "policy loss"}
+    panels["losses/total_loss"] = "total loss"
+    for ax, (tag, label) in zip(figure.subplots(1, 3), panels.items()):
+        logged = [curve[tag] for curve in curves if tag in curve]
+        if len(logged) > 1:
+            for k, (steps, values) in enumerate(logged):
+                ax.plot(steps, values, color="tab:red", linewidth=0.7, alpha=0.4, label="" if k else "each seed")
+            ax.plot(*median_curve(logged), **POLICY, label=f"median of {len(logged)} seeds")
+        elif logged:
+            ax.plot(*logged[0], **{**POLICY, "linewidth": 1.1}, label="policy, sampled actions")
+        if tag == "charts/episodic_return":
+            mean = metrics["reference_episodic_return"]
+            ax.axhline(mean, **{**OPTIMUM, "linewidth": 1.4}, label=f"optimum, mean {mean:.2f}")
+            ax.legend(loc="lower right")
+        ax.xaxis.set_major_formatter(EngFormatter(sep=""))
+        ax.set(xlabel="environment steps", ylabel=label)
+        ax.grid(alpha=0.3)
+    return figure
+
+
+def median_curve(curves: list[tuple]) -> tuple[np.ndarray, np.ndarray]:
+    """Median over seeds at the first seed's steps, as far as every seed has come; curves are linear between steps."""
+    start, end = max(steps[0] for steps, _ in curves), min(steps[-1] for steps, _ in curves)
+    grid = curves[0][0]
+    grid = grid[(start <= grid) & (grid <= end)]
+    return grid, np.median([np.interp(grid, steps, values) for steps, values in curves], axis=0)
+
+
+def draw_trajectories(arrays: dict, metrics: dict) -> Figure:
+    """Phase plane, position, velocity and control of the first ten starts, with targets and the phases' ends."""
+    problem, t = envs.PROBLEMS[metrics["env_id"]], arrays["t"]
+    figure = Figure(figsize=(11, 8.5), layout="constrained")
+    (plane, position), (velocity, control) = figure.subplots(2, 2)
+    for suffix, style in (("", POLICY), ("_reference", OPTIMUM)):
+        for x, u in zip(arrays[f"x{suffix}"][:SHOWN], arrays[f"u{suffix}"][:SHOWN]):
+            plane.plot(x[:, 0], x[:, 1], **style)
+            position.plot(t, x[:, 0], **style)
+            velocity.plot(t, x[:, 1], **style)
+            control.stairs(u, t, baseline=None, **style)  # held over each step
+    plane.plot(*arrays["x"][:SHOWN, 0].T, "k.")
+    mark_targets(problem, plane, position, velocity)
+    end = 0
+    for phase in problem.phases[:-1]:
+        end += phase.steps
+        for ax in (position, velocity, control):
+            ax.axvline(t[end], **BOUNDARY)
+    for bound in (-problem.u_max, problem.u_max):
+        control.axhline(bound, **{**BOUNDARY, "linestyle": "--"})
+    plane.set(xlabel="position $x_1$", ylabel="velocity $x_2$", title="Phase plane")
+    plane.axis("equal")
+    position.set(xlabel="time (s)", ylabel="position $x_1$", title="Position")
+    velocity.set(xlabel="time (s)", ylabel="velocity $x_2$", title="Velocity")
+    control.set(xlabel="time (s)", ylabel="control $u$", title=f"Control (bounds ±{problem.u_max})")
+    for ax in figure.axes:
+        ax.grid(alpha=0.3)
+    figure.suptitle(f"{headline(metrics)}\nthe first {len(arrays['x'][:SHOWN])} starts")
+    add_legend(figure, problem)
+    return figure
+
+
+def mark_targets(problem: envs.Problem, plane, position, velocity):
+    """Green: each phase's target circle in the phase plane, and its target as a dashed line over the phase's time."""
+    start = 0.0
+    for k, phase in enumerate(problem.phases, start=1):
+        plane.add_patch(Circle(phase.target, phase.radius, fill=False, zorder=3, **TARGET))
+        if len(problem.phases) > 1:
+            offset = (-3, -16) if k == 1 else (-10, 5)  # points: the paths come in from the other sides
+            plane.annotate(f"{k}", phase.target, offset, textcoords="offset points", color="tab:green", weight="bold")
+        end = start + phase.steps * problem.dt
+        for ax, value in zip((position, velocity), phase.target):
+            ax.plot([start, end], [value, value], linestyle="--", zorder=3, **TARGET)
+        start = end
+
+
+def add_legend(figure: Figure, problem: envs.Problem):
+    """One legend for all panels, below them."""
+    radius = problem.phases[0].radius
+    handles = [
+        Line2D([], [], **POLICY, label="policy"),
+        Line2D([], [], **OPTIMUM, label="optimum"),
+        Line2D([], [], **TARGET, linestyle="--", marker="o", fillstyle="none", label=f"target (radius {radius})"),
+        Line2D([], [], color="k", marker=".", linestyle="", label="start"),
+    ]
+    if len(problem.phases) > 1:
+        handles.append(Line2D([], [], **BOUNDARY, label="end of a phase"))
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
+
+
+def draw_costs(arrays: dict, metrics: dict) -> Figure:
+    """Total costs of all starts as a histogram; of the first ten their total with the ratio, and its three parts."""
+    env_id = metrics["env_id"]
+    ours, optimum = (cost_parts(env_id, arrays[f"x{s}"], arrays[f"u{s}"]) for s in ("", "_reference"))
+    figure = Figure(figsize=(12, 7), layout="constrained")
+    panels = figure.subplot_mosaic([["all", "total", "total"], ["state", "control", "terminal"]])
+    cost, reference_cost = arrays["cost"], arrays["cost_reference"]
+    bins = np.histogram_bin_edges([cost, reference_cost], bins=min(40, max(5, len(cost) // 5)))
+    panels["all"].hist(cost, bins, color="tab:red", alpha=0.45, label="policy")
+    panels["all"].hist(reference_cost, bins, histtype="step", color="tab:blue", linewidth=1.4, label="optimum")
+    panels["all"].set(xlabel="total cost J", ylabel="starts", title=f"All {len(cost)} starts")
+    draw_bars(panels["total"], cost, reference_cost, "total cost J")
+    chosen = comparable(env_id, arrays["x"], arrays["x_reference"])
+    for k in range(min(SHOWN, len(cost))):
+        text = f"{cost[k] / reference_cost[k]:.3f}" if chosen[k] else "miss"  # a missed circle forbids a ratio
+        top = k + 1, max(cost[k], reference_cost[k])
+        panels["total"].annotate(text, top, (0, 3), textcoords="offset points", ha="center", fontsize=9)
+    panels["total"].margins(y=0.12)
+    panels["total"].set_title("The first starts, with the ratio policy / optimum")
+    for part, name in enumerate(("state", "control", "terminal")):
+        draw_bars(panels[name], ours[:, part], optimum[:, part], f"{name} cost")
+    panels["all"].legend()
+    figure.suptitle(headline(metrics))
+    return figure
+
+
+def draw_bars(ax, ours: np.ndarray, optimum: np.ndarray, label: str):
+    """Bars of the first ten starts side by side; `ours` and `optimum` are costs, (n,)."""
+    case = np.arange(1, min(SHOWN, len(ours)) + 1)
+    ax.bar(case - 0.2, ours[:SHOWN], 0.4, color="tab:red", label="policy")
+    ax.bar(case + 0.2, optimum[:SHOWN], 0.4, color="tab:blue", hatch="///", edgecolor="white", label="optimum")
+    ax.set(xlabel="start", ylabel=label, xticks=case)
+    ax.grid(axis="y", alpha=0.3)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Results folders
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def publish(run_dir, folder, ship: bool = False):
+    """Add a run to a results folder: its eval.json and training curve under seeds/, and the policy if it is shipped.
+
+    The policy, its evaluation and the figures are replaced only where the folder ships none or with `ship`. OSError or
+    ValueError says what is missing or does not fit; nothing has been written then.
+    """
+    run_dir, folder = Path(run_dir), Path(folder)
+    metrics, _ = read_evaluation(run_dir)
+    digest = hashlib.sha256((run_dir / "agent.safetensors").read_bytes()).hexdigest()
+    if metrics.get("checkpoint_sha256") != digest:
+        raise ValueError(f"{run_dir}/eval.json is not of its agent.safetensors (checkpoint_sha256 differs)")
+    curve = read_curve(run_dir)
+    if not curve:
+        raise ValueError(f"{run_dir} has no TensorBoard scalars")
+    shipped = read_json(folder / "eval.json") if (folder / "eval.json").exists() else None
+    if shipped and shipped["env_id"] != metrics["env_id"]:
+        raise ValueError(f"{run_dir} is of {metrics['env_id']}, {folder} of {shipped['env_id']}")
+    if shipped and not ship and shipped["seed"] == metrics["seed"]:
+        raise ValueError(f"{folder} already ships seed {metrics['seed']}; --ship replaces it")
+    (folder / "seeds").mkdir(parents=True, exist_ok=True)
+    write_csv(folder / "seeds" / f"{metrics['seed']}.csv", curve)
+    write_bytes(folder / "seeds" / f"{metrics['seed']}.json", (run_dir / "eval.json").read_bytes())
+    if ship or not shipped:
+        for name in ("agent.safetensors", "eval.npz", "eval.json"):
+            write_bytes(folder / name, (run_dir / name).read_bytes())
+        redraw(folder)
+
+
+def redraw(folder) -> list[Path]:
+    """Draw the figures of a results or run folder from its files; returns their paths."""
+    folder = Path(folder)
+    metrics, arrays = read_evaluation(folder)
+    curves = {path.stem: read_csv(path) for path in sorted((folder / "seeds").glob("*.csv"))}
+    curve = curves.pop(str(metrics["seed"]), None) or read_curve(folder) or None
+    return figures(folder / "figures", arrays, metrics, curve, list(curves.values()))
+
+
+def seed_lines(folder) -> list[str]:
+    """One line a seed of a results folder with its ratio of sums, and their median and range; none for one seed."""
+    runs = sorted((read_json(path) for path in (Path(folder) / "seeds").glob("*.json")), key=lambda run: run["seed"])
+    if len(runs) < 2:
+        return []
+    lines = []
+    for run in runs:
+        ratio = f"{run['ratio_of_sums']:.4f}" if "ratio_of_sums" in run else "none"
+        lines.append(f"  seed {run['seed']}: ratio of sums {ratio}, hit rate {run['hit_rate']:.1%}")
+    if ratios := [run["ratio_of_sums"] for run in runs if "ratio_of_sums" in run]:
+        lines.append(f"  {len(ratios)} seeds: median {np.median(ratios):.4f}, {min(ratios):.4f} to {max(ratios):.4f}")
+    return lines
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Command line
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def main():
+    """`python evaluate.py publish RUN_DIR FOLDER [--ship]` and `python evaluate.py figures FOLDER`."""
+    parser = argparse.ArgumentParser(description="Results folders: add a run, redraw figures, print the table.")
+    commands = parser.add_subparsers(dest="command", required=True)
+    command = commands.add_parser("publish", help="add a run to a results folder")
+    command.add_argument("run_dir", type=Path, help="a finished run: runs/...")
+    command.add_argument("folder", type=Path, help="results/<name>, made if it does not exist")
+    command.add_argument("--ship", action="store_true", help="replace the policy that the folder ships")
+    command = commands.add_parser("figures", help="redraw the figures of a results or run folder, print its table")
+    command.add_argument("folder", type=Path, help="results/<name> or runs/...")
+    args = parser.parse_args()
+    try:
+        if args.command == "publish":
+            publish(args.run_dir, args.folder, args.ship)
+        else:
+            for path in redraw(args.folder):
+                print(path)
+        print("\n".join([table(read_json(args.folder / "eval.json")), *seed_lines(args.folder)]))
+    except (OSError, ValueError) as error:
+        sys.exit(f"evaluate.py: {error}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,314 @@
+"""baselines.py against the published numbers, against one another, and against cost sums written out here."""
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import baselines
+from baselines import box_qp, hermite_simpson, lqr, lqr_policy, optimise, reference, replay
+from envs import DOUBLE_INTEGRATOR, PROBLEMS, VAN_DER_POL, fly
+
+ROOT = Path(__file__).resolve().parents[1]
+KEYS = {"x", "u", "reward", "episodic_return", "cost", "cost_state", "cost_control", "cost_terminal", "hit"}
+KEYS |= {"terminal_error"}
+
+
+def starts(n, seed=0):
+    return np.random.default_rng(seed).uniform(-1, 1, (n, 2))
+
+
+def over_the_box(points):
+    """Starts (points^2, 2) and weights of the Gauss-Legendre rule: the mean over the box without sampling error."""
+    nodes, weights = np.polynomial.legendre.leggauss(points)
+    return np.stack(np.meshgrid(nodes, nodes), axis=-1).reshape(-1, 2), np.outer(weights, weights).ravel() / 4
+
+
+def flown(env_id, x0, u):
+    return fly(env_id, lambda obs, t: u[:, t, None], x0)
+
+
+# --- double integrator ------------------------------------------------------------------------------------------------
+
+
+def test_riccati_numbers():
+    K, P = lqr(DOUBLE_INTEGRATOR)
+    assert K.shape == (50, 2) and P.shape == (51, 2, 2)
+    np.testing.assert_allclose(K[0], [2.585923, 3.443511], atol=5e-7)
+    np.testing.assert_allclose(P[0], [[13.317991, 3.201823], [3.201823, 4.603603]], atol=5e-7)
+    assert np.trace(P[0]) / 3 == pytest.approx(5.97386, abs=5e-6)
+    np.testing.assert_array_equal(P[-1], 20 * np.eye(2))
+
+
+def test_riccati_is_the_least_squares_optimum():
+    """Without its bound the problem is least squares in u: x'P_0 x is its minimum and -K_0 x its first control."""
+    A, B = np.array([[1, 0.1], [0, 1]]), np.array([0.005, 0.1])
+    K, P = lqr(DOUBLE_INTEGRATOR)
+    x0 = np.array([0.7, -0.4])
+    free, forced, rows, right = x0, np.zeros((2, 50)), [], []
+    for t in range(51):
+        scale = np.sqrt(20.0) if t == 50 else 1.0
+        rows.append(scale * forced)
+        right.append(-scale * free)
+        free, forced = A @ free, A @ forced
+        if t < 50:
+            forced[:, t] += B
+    system, right = np.vstack([*rows, np.sqrt(0.1) * np.eye(50)]), np.concatenate([*right, np.zeros(50)])
+    u, residual, *_ = np.linalg.lstsq(system, right)
+    assert x0 @ P[0] @ x0 == pytest.approx(residual[0], rel=1e-12)
+    assert -K[0] @ x0 == pytest.approx(u[0], rel=1e-10)
+
+
+def test_saturation_numbers():
+    x0 = starts(1000)
+    optimum, (_, P) = reference("DoubleIntegrator-v0", x0), lqr(DOUBLE_INTEGRATOR)
+    unbounded = np.einsum("ni,ij,nj->n", x0, P[0], x0)
+    ratio, saturates = optimum["cost"] / unbounded, (np.abs(optimum["u"]) == 4).any(axis=1)
+    assert saturates.mean() == pytest.approx(0.11, abs=0.01)
+    assert ratio.mean() == pytest.approx(1.0007, abs=1e-4)
+    assert ratio.max() == pytest.approx(1.027, abs=2e-3)
+    np.testing.assert_allclose(ratio[~saturates], 1, rtol=0, atol=1e-12)
+    assert optimum["episodic_return"].mean() == pytest.approx(14.0, abs=0.1)
+    assert optimum["hit"].all() and KEYS <= set(optimum)
+
+
+def test_clipped_lqr_is_the_box_qp_optimum():
+    x0 = np.vstack([starts(100), [[1, 1], [-1, -1], [1, -1]]])
+    u = box_qp(DOUBLE_INTEGRATOR, x0)
+    optimum = reference("DoubleIntegrator-v0", x0)
+    assert (np.abs(u).max(axis=1) > 4 - 1e-12).sum() >= 5, "some starts should saturate"
+    np.testing.assert_allclose(optimum["cost"], flown("DoubleIntegrator-v0", x0, u)["cost"], rtol=1e-9)
+    np.testing.assert_allclose(optimum["u"], u, rtol=0, atol=1e-9)
+
+
+def test_ipopt_is_lqr_where_it_does_not_saturate():
+    x0 = starts(60)
+    expected = reference("DoubleIntegrator-v0", x0)
+    inside = np.abs(expected["u"]).max(axis=1) < 3.9
+    assert 40 < inside.sum() < 60
+    u, cost, feasible = optimise("DoubleIntegrator-v0", x0[inside])
+    assert feasible.all()
+    np.testing.assert_allclose(cost, expected["cost"][inside], rtol=1e-9)
+    np.testing.assert_allclose(u, expected["u"][inside], rtol=0, atol=1e-6)
+
+
+# --- Van der Pol ------------------------------------------------------------------------------------------------------
+
+
+def test_van_der_pol_numbers():
+    x0, weights = over_the_box(8)
+    optimum = reference("VanDerPol-v0", x0)
+    assert weights @ optimum["cost"] == pytest.approx(11.792, abs=0.002)
+    assert optimum["terminal_error"].max() == pytest.approx(0.0145, abs=1e-3) and optimum["hit"].all()
+    assert optimum["replay_error"].max() < 1e-8 and KEYS <= set(optimum)
+
+
+def test_van_der_pol_optimum_cannot_be_improved_by_small_changes():
+    x0, rng = starts(20), np.random.default_rng(1)
+    optimum = reference("VanDerPol-v0", x0)
+    for size in (1e-3, 1e-2, 0.1):
+        u = np.clip(optimum["u"] + size * rng.standard_normal(optimum["u"].shape), -1.5, 1.5)
+        assert (flown("VanDerPol-v0", x0, u)["cost"] > optimum["cost"]).all()
+
+
+def test_collocation_and_linear_feedback_beside_the_optimum():
+    x0 = starts(50)
+    optimum = reference("VanDerPol-v0", x0)["cost"]
+    u, cost, feasible = optimise("VanDerPol-v0", x0, hermite_simpson)
+    assert feasible.all()
+    np.testing.assert_allclose(cost, optimum, rtol=1e-5)
+    assert not np.array_equal(cost, optimum), "collocation should be another discretisation"
+    collocated = flown("VanDerPol-v0", x0, u)["cost"]
+    assert (collocated >= optimum * (1 - 1e-9)).all() and collocated.sum() / optimum.sum() < 1 + 1e-6
+    linear = fly("VanDerPol-v0", lqr_policy(VAN_DER_POL), x0)["cost"]
+    assert (linear > optimum * (1 - 1e-9)).all() and 1.00005 < linear.sum() / optimum.sum() < 1.001
+
+
+def test_result_does_not_depend_on_the_number_of_processes():
+    x0 = starts(12)
+    alone = reference("VanDerPol-v0", x0, processes=1)
+    shared = reference("VanDerPol-v0", x0, processes=2)
+    backwards = reference("VanDerPol-v0", x0[::-1], processes=1)
+    for key, value in alone.items():
+        np.testing.assert_array_equal(shared[key], value)
+        np.testing.assert_array_equal(backwards[key][::-1], value)
+
+
+# --- waypoints --------------------------------------------------------------------------------------------------------
+
+# env id: mean costs over the box without and with the circles, distances at the phases' ends without and with.
+# The costs are means over the box (16 x 16 Gauss-Legendre points); the distances hardly depend on the start.
+WAYPOINTS = {
+    "DoubleIntegratorWaypoints-v0": ((16.747, 17.659), (0.075, 0.157), (0.02, 0.02), 0.91),
+    "VanDerPolWaypoints-v0": ((17.019, 17.271), (0.0117, 0.0058, 0.118), (0.0117, 0.0055, 0.05), 0.25),
+}
+
+
+@pytest.mark.parametrize("env_id", WAYPOINTS)
+def test_waypoint_numbers(env_id):
+    (cost_free, cost), distance_free, distance, extra = WAYPOINTS[env_id]
+    x0, weights = over_the_box(6)
+    optimum = reference(env_id, x0)
+    assert weights @ optimum["cost_free"] == pytest.approx(cost_free, abs=0.02)
+    assert weights @ optimum["cost"] == pytest.approx(cost, abs=0.02)
+    np.testing.assert_allclose(optimum["cost"] - optimum["cost_free"], extra, atol=0.01)
+    np.testing.assert_allclose(optimum["terminal_error_free"].mean(axis=0), distance_free, atol=1e-3)
+    np.testing.assert_allclose(optimum["terminal_error"].mean(axis=0), distance, atol=1e-3)
+    assert optimum["hit"].all() and optimum["constrained"].all() and not optimum["infeasible"].any()
+    assert optimum["replay_error"].max() < 1e-8
+    assert KEYS | {"constrained"} <= set(optimum)
+
+
+@pytest.mark.parametrize("bonus, constrained", [(0.4, False), (0.5, True)])
+def test_better_solution_is_chosen_with_its_bonus(monkeypatch, bonus, constrained):
+    """Hitting both circles costs 0.912 more: two bonuses of 0.4 are not worth it, two of 0.5 are."""
+    problem = PROBLEMS["DoubleIntegratorWaypoints-v0"]
+    phases = tuple(replace(phase, bonus=bonus) for phase in problem.phases)
+    monkeypatch.setitem(PROBLEMS, problem.env_id, replace(problem, phases=phases))
+    optimum = reference(problem.env_id, starts(3))
+    assert (optimum["constrained"] == constrained).all() and (optimum["hit"] == constrained).all()
+    np.testing.assert_allclose(optimum["cost"] - optimum["cost_free"], 0.912 if constrained else 0, rtol=0, atol=0.005)
+    np.testing.assert_allclose(optimum["episodic_return"], 2 * bonus * constrained - optimum["cost"], rtol=1e-12)
+
+
+@pytest.mark.parametrize("env_id, near, far", [
+    ("DoubleIntegratorWaypoints-v0", [18.0, 0.0], [30.0, 0.0]),  # from rest 3 m/s^2 moves u T^2 / 4 = 18.75 in 5 s
+    ("VanDerPolWaypoints-v0", [5.0, 0.0], [8.0, 0.0]),
+])  # fmt: skip
+def test_unreachable_circle_falls_back_to_the_free_optimum(env_id, near, far):
+    optimum = reference(env_id, [near, far])
+    assert optimum["constrained"].tolist() == [True, False] and optimum["infeasible"].tolist() == [False, True]
+    assert optimum["hit"][0].all() and not optimum["hit"][1, 0]
+    assert optimum["cost"][0] > optimum["cost_free"][0] and optimum["cost"][1] == optimum["cost_free"][1]
+
+
+@pytest.mark.parametrize("env_id", WAYPOINTS)
+def test_optimum_ends_on_the_edge_of_its_last_circle(env_id):
+    """From inside: never outside by the solver's tolerance."""
+    optimum = reference(env_id, starts(20, seed=3))
+    radius = PROBLEMS[env_id].phases[-1].radius
+    assert (optimum["terminal_error"][:, -1] <= radius).all()
+    np.testing.assert_allclose(optimum["terminal_error"][:, -1], radius, rtol=1e-8)
+
+
+# --- errors -----------------------------------------------------------------------------------------------------------
+
+
+def test_solver_failure_names_the_start():
+    with pytest.raises(RuntimeError, match=r"start 1, x0 = \[1000.0, 1000.0\], of VanDerPol-v0: IPOPT stopped with "):
+        reference("VanDerPol-v0", [[0.1, 0.1], [1000.0, 1000.0]], processes=1)
+
+
+def test_replay_refuses_a_cost_that_is_not_flown():
+    x0 = starts(4)
+    u, cost, _ = optimise("VanDerPol-v0", x0)
+    assert replay("VanDerPol-v0", x0, u, cost * (1 + 1e-10))["replay_error"].max() < 1e-8
+    wrong = cost.copy()
+    wrong[2] *= 1 + 1e-7
+    with pytest.raises(RuntimeError, match="start 2, .* of VanDerPol-v0: its optimum costs"):
+        replay("VanDerPol-v0", x0, u, wrong)
+    with pytest.raises(RuntimeError, match="start 3, "):
+        replay("VanDerPol-v0", x0, u, np.where(np.arange(4) == 3, np.nan, cost))
+
+
+def test_optimum_that_misses_its_circle_is_an_error(monkeypatch):
+    def without_circles(env_id, x0, in_circles=False, processes=None):
+        return optimise(env_id, x0, processes=processes)
+
+    monkeypatch.setattr(baselines, "optimise", without_circles)
+    with pytest.raises(RuntimeError, match="start 0, .* misses its circles"):
+        reference("DoubleIntegratorWaypoints-v0", starts(2))
+
+
+@pytest.mark.parametrize("env_id, x0, processes, message", [
+    ("Pendulum-v1", [[0.0, 0.0]], None, "env_id is 'Pendulum-v1'; it must be one of DoubleIntegrator-v0"),
+    ("VanDerPol-v0", [0.0, 0.0], None, r"x0 must be finite, of shape \(n, 2\)"),
+    ("VanDerPol-v0", np.zeros((0, 2)), None, r"x0 must be finite, of shape \(n, 2\)"),
+    ("DoubleIntegrator-v0", [[0.0, np.nan]], None, r"x0 must be finite, of shape \(n, 2\)"),
+    ("VanDerPol-v0", [[0.0, 0.0]], 0, "processes is 0; it must be at least 1"),
+])  # fmt: skip
+def test_bad_arguments_are_refused(env_id, x0, processes, message):
+    with pytest.raises(ValueError, match=message):
+        reference(env_id, x0, processes)
+
+
+def test_lqr_refuses_waypoints():
+    with pytest.raises(ValueError, match="DoubleIntegratorWaypoints-v0 has 2 phases"):
+        lqr(PROBLEMS["DoubleIntegratorWaypoints-v0"])
+
+
+# --- command line -----------------------------------------------------------------------------------------------------
+
+
+def run(folder, *arguments):
+    command = [sys.executable, str(ROOT / "baselines.py"), *arguments]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=60)
+
+
+@pytest.mark.parametrize("name, env_id, key", [
+    ("double-integrator", "DoubleIntegrator-v0", "K0_1"),
+    ("van-der-pol", "VanDerPol-v0", "collocation_ratio_of_sums"),
+    ("double-integrator-waypoints", "DoubleIntegratorWaypoints-v0", "cost_free_mean"),
+    ("van-der-pol-waypoints", "VanDerPolWaypoints-v0", "distance_phase_3"),
+])  # fmt: skip
+def test_command_writes_what_it_prints(tmp_path, name, env_id, key):
+    ended = run(tmp_path, name, "--starts", "5", "--seed", "7", "--json", "a.json", "--npz", "a.npz")
+    assert ended.returncode == 0 and ended.stderr == ""
+    numbers = json.loads((tmp_path / "a.json").read_text())
+    printed = dict(line.split() for line in ended.stdout.splitlines())
+    assert numbers["env_id"] == env_id and printed.keys() == numbers.keys() and key in numbers
+    assert all(isinstance(value, str | int | float) for value in numbers.values())
+    assert float(printed["cost_mean"]) == pytest.approx(numbers["cost_mean"], rel=1e-6)
+    with np.load(tmp_path / "a.npz") as arrays:
+        assert set(arrays) == {"t", "x_reference", "u_reference", "cost_reference"}
+        np.testing.assert_array_equal(arrays["x_reference"][:, 0], starts(5, seed=7))
+        np.testing.assert_allclose(arrays["t"], 0.1 * np.arange(PROBLEMS[env_id].steps + 1))
+        again = flown(env_id, starts(5, seed=7), arrays["u_reference"])
+        np.testing.assert_array_equal(arrays["x_reference"], again["x"])
+        np.testing.assert_array_equal(arrays["cost_reference"], again["cost"])
+    assert numbers["cost_mean"] == pytest.approx(again["cost"].mean())
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.json", "a.npz"]
+
+
+@pytest.mark.parametrize("arguments, message", [
+    (["pendulum"], "invalid choice: 'pendulum'"),
+    ([], "required: command"),
+    (["van-der-pol", "--starts", "0"], "--starts: '0' must be a whole number from 1 to 100000"),
+    (["van-der-pol", "--starts", "nan"], "--starts: 'nan' must be a whole number from 1 to 100000"),
+    (["van-der-pol", "--seed", "-1"], "--seed: '-1' must be a whole number from 0 to 4294967295"),
+    (["van-der-pol", "--npz", "missing/a.npz"], "--npz: 'missing/a.npz' must be a file in an existing"),
+])  # fmt: skip
+def test_bad_command_is_one_line(tmp_path, capsys, monkeypatch, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as ended:
+        baselines.parse_args([*arguments, "--json", "a.json"] if arguments else [])
+    assert ended.value.code.startswith("error: ") and message in ended.value.code
+    assert "\n" not in ended.value.code and capsys.readouterr().err == "" and not list(tmp_path.iterdir())
+
+
+def test_bad_command_ends_with_an_error_status(tmp_path):
+    ended = run(tmp_path, "van-der-pol", "--starts", "0", "--json", "a.json")
+    assert ended.returncode == 1 and ended.stderr.count("\n") == 1 and ended.stdout == ""
+    assert not list(tmp_path.iterdir())
+
+
+def test_failed_write_leaves_the_old_file(tmp_path):
+    path = tmp_path / "a.json"
+    path.write_text("old")
+
+    def breaks_off(file):
+        file.write(b"half")
+        raise OSError("disk full")
+
+    with pytest.raises(OSError, match="disk full"):
+        baselines.write(path, breaks_off)
+    assert path.read_text() == "old" and [file.name for file in tmp_path.iterdir()] == ["a.json"]
+
+
+def test_casadi_and_torch_are_not_imported_with_the_module():
+    code = "import sys, baselines; sys.exit(bool({'casadi', 'torch'} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, timeout=60).returncode == 0

@@ -1,0 +1,501 @@
+"""evaluate.py against plain loops: ratios, the interface's keys, figures, results folders, bad input."""
+
+import csv
+import hashlib
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import envs
+import evaluate
+
+ROOT = Path(__file__).parent.parent
+SINGLE, WAYPOINTS = "DoubleIntegrator-v0", "DoubleIntegratorWaypoints-v0"
+
+# INTERFACE, "eval.json": all but what the script adds (seed, checkpoint_sha256, total_updates, ...)
+COMMON = {"env_id", "eval_seed", "eval_starts", "episodic_return", "reference_episodic_return"}
+RATIOS = {"ratio_of_sums", "ratio_mean", "ratio_median", "ratio_p95", "ratio_min", "ratio_max"}
+TEN_STARTS = {"ten_start_ratio_mean_p50", "ten_start_ratio_mean_p95"}
+COSTS = {f"{side}cost{part}_mean" for side in ("", "reference_") for part in ("", "_state", "_control", "_terminal")}
+HITS = {"hit_rate", "reference_hit_rate", "terminal_error_max", "hit_rate_phase_1"}
+ARRAYS = {"t", "x", "u", "reward", "cost", "x_reference", "u_reference", "cost_reference"}
+
+
+def feedback(env_id, terminal_weight, effort=1.0):
+    """A policy that steers to each phase's target: affine LQR of the dynamics linearised about the origin.
+
+    The state is [x1, x2, 1]; a large `terminal_weight` ends close to the target. The environment clips.
+    """
+    problem = envs.PROBLEMS[env_id]
+    h = 1e-6
+    step = [envs.rk4(problem.f, (h * a, h * b), h * c, problem.dt) for a, b, c in ((1, 0, 0), (0, 1, 0), (0, 0, 1))]
+    A, B = np.eye(3), np.zeros((3, 1))
+    A[:2, :2], B[:2, 0] = np.array(step[:2]).T / h, np.array(step[2]) / h
+    P, gains = np.zeros((3, 3)), []
+    for phase in problem.phases[::-1]:
+        d = np.array([[1, 0, -phase.target[0]], [0, 1, -phase.target[1]]])  # distance to the target
+        P = P + terminal_weight * d.T @ d
+        for _ in range(phase.steps):
+            K = np.linalg.solve(B.T @ P @ B + effort * phase.R, B.T @ P @ A)
+            P = d.T @ d + A.T @ P @ (A - B @ K)
+            gains.insert(0, K[0])
+    return lambda obs, t: -(obs[:, :2] @ gains[t][:2] + gains[t][2])[:, None]
+
+
+def lets_go(policy, mask, t_end):
+    """The policy, but without control from step t_end on in the flights of `mask`, (n,) or one bool: they miss."""
+    return lambda obs, t: policy(obs, t) * np.where(np.broadcast_to(mask, len(obs)) & (t >= t_end), 0.0, 1.0)[:, None]
+
+
+def reference_flight(env_id, seed, n, misses=False):
+    """A hand-made reference in the form of `baselines.reference`: a feedback that hits but in the flights `misses`."""
+    effort = 100.0 if env_id == "VanDerPolWaypoints-v0" else 1.0  # low gains: the linear law is then good enough
+    policy = lets_go(feedback(env_id, 1e3, effort), misses, 90)
+    return envs.fly(env_id, policy, evaluate.starts(seed, n))
+
+
+def make_run(folder, seed=1, env_id=SINGLE, level=0.0):
+    """A synthetic run folder: events, checkpoint, eval.json, eval.npz; returns it."""
+    from torch.utils.tensorboard import SummaryWriter
+
+    folder.mkdir(parents=True)
+    with SummaryWriter(folder) as writer:
+        for update in range(1, 31):
+            step = 4000 * update
+            writer.add_scalar("charts/episodic_return", 14 - 30 * 0.8**update + level, step)
+            writer.add_scalar("losses/policy_loss", -0.1 / update, step)
+            writer.add_scalar("losses/total_loss", 5 / update, step)
+            if update % 10 == 0:
+                writer.add_scalar("eval/ratio_of_sums", 1 + 1 / update, step)
+    (folder / "agent.safetensors").write_bytes(b"weights of seed %d" % seed)
+    reference = reference_flight(env_id, 3, 12)
+    metrics, arrays = evaluate.evaluate(env_id, feedback(env_id, 1e3, effort=1.5), 3, 12, reference)
+    digest = hashlib.sha256((folder / "agent.safetensors").read_bytes()).hexdigest()
+    evaluate.write_json(folder / "eval.json", {**metrics, "seed": seed, "checkpoint_sha256": digest})
+    evaluate.write_npz(folder / "eval.npz", arrays)
+    return folder
+
+
+def snapshot(folder):
+    """Every file below a folder with its bytes."""
+    return {path.relative_to(folder): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def command_line(monkeypatch, capsys, *words):
+    """Run `python evaluate.py words...` in this process; returns what it printed, raises SystemExit as it does."""
+    monkeypatch.setattr(sys, "argv", ["evaluate.py", *map(str, words)])
+    evaluate.main()
+    return capsys.readouterr().out
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Cases and ratios
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def test_starts_are_those_of_the_interface():
+    assert np.array_equal(evaluate.starts(7, 5), np.random.default_rng(7).uniform(-1, 1, (5, 2)))
+
+
+def test_metrics_of_a_single_phase_equal_plain_loops():
+    n = 30
+    reference = reference_flight(SINGLE, 5, n)
+    metrics, arrays = evaluate.evaluate(SINGLE, feedback(SINGLE, 0.0, effort=60.0), 5, n, reference)
+    state, control, terminal, hits, errors = [], [], [], 0, []
+    for x, u in zip(arrays["x"], arrays["u"]):  # the table's numbers: Q = I, R = 0.1, Qf = 20, radius 0.05
+        state.append(sum(a * a + b * b for a, b in x[:-1]))
+        control.append(sum(0.1 * v * v for v in u))
+        terminal.append(20.0 * (x[-1][0] ** 2 + x[-1][1] ** 2))
+        errors.append((x[-1][0] ** 2 + x[-1][1] ** 2) ** 0.5)
+        hits += errors[-1] <= 0.05
+    total = [sum(parts) for parts in zip(state, control, terminal)]
+    ratios = sorted(ours / best for ours, best in zip(total, reference["cost"]))
+    position = 0.95 * (n - 1)
+    p95 = ratios[int(position)] + (position % 1) * (ratios[int(position) + 1] - ratios[int(position)])
+    expected = {
+        "cost_mean": sum(total) / n,
+        "cost_state_mean": sum(state) / n,
+        "cost_control_mean": sum(control) / n,
+        "cost_terminal_mean": sum(terminal) / n,
+        "reference_cost_mean": sum(reference["cost"]) / n,
+        "reference_cost_control_mean": sum(0.1 * v * v for u in reference["u"] for v in u) / n,
+        "ratio_of_sums": sum(total) / sum(reference["cost"]),
+        "ratio_mean": sum(ratios) / n,
+        "ratio_median": (ratios[14] + ratios[15]) / 2,
+        "ratio_p95": p95,
+        "ratio_min": ratios[0],
+        "ratio_max": ratios[-1],
+        "episodic_return": (20.0 * hits - sum(total)) / n,
+        "reference_episodic_return": sum(map(sum, reference["reward"])) / n,
+        "hit_rate": hits / n,
+        "hit_rate_phase_1": hits / n,
+        "reference_hit_rate": 1.0,
+        "terminal_error_max": max(errors),
+    }
+    assert 0 < hits < n, "the case must tell hits from misses"
+    assert {key: metrics[key] for key in expected} == pytest.approx(expected, rel=1e-12)
+    assert evaluate.cost_parts(SINGLE, arrays["x"], arrays["u"]) == pytest.approx(np.c_[state, control, terminal])
+
+
+@pytest.mark.parametrize("env_id", envs.PROBLEMS)
+def test_cost_parts_equal_the_environments(env_id):
+    flight = envs.fly(env_id, feedback(env_id, 5.0, effort=2.0), evaluate.starts(1, 6))
+    parts = np.c_[flight["cost_state"], flight["cost_control"], flight["cost_terminal"]]
+    assert evaluate.cost_parts(env_id, flight["x"], flight["u"]) == pytest.approx(parts, rel=1e-12)
+    assert np.array_equal(evaluate.hits_every_circle(env_id, flight["x"]), flight["hit"].all(axis=1))
+
+
+def test_ten_start_statistic_is_the_papers():
+    rng = np.random.default_rng(0)
+    cost, optimum = rng.uniform(2, 3, (2, 40))
+    metrics = evaluate.ratio_metrics(cost, optimum, eval_seed=9)
+    rng, means = np.random.default_rng([9, 1]), []
+    for _ in range(100):
+        drawn = rng.choice(40, 10, replace=False)
+        assert len(set(drawn)) == 10
+        means.append(sum(cost[i] / optimum[i] for i in drawn) / 10)
+    means.sort()
+    assert metrics["ten_start_ratio_mean_p50"] == pytest.approx((means[49] + means[50]) / 2, rel=1e-12)
+    assert metrics["ten_start_ratio_mean_p95"] == pytest.approx(means[94] + 0.05 * (means[95] - means[94]), rel=1e-12)
+    assert metrics == evaluate.ratio_metrics(cost, optimum, eval_seed=9)
+    assert metrics != evaluate.ratio_metrics(cost, optimum, eval_seed=10)
+    ten = evaluate.ratio_metrics(cost[:10], optimum[:10], eval_seed=9)
+    assert ten["ten_start_ratio_mean_p95"] == pytest.approx(ten["ratio_mean"])  # one way only to draw ten of ten
+    assert evaluate.ratio_metrics(cost[:9], optimum[:9], eval_seed=9).keys() == RATIOS
+
+
+def test_waypoint_ratios_are_over_the_starts_that_hit_every_circle():
+    n = 24
+    good = feedback(WAYPOINTS, 1e3, effort=1.3)
+
+    # every third of ours lets go before the second circle, and every fourth optimum does not bother to hit
+    policy = lets_go(good, np.arange(n) % 3 == 0, 90)
+    reference = reference_flight(WAYPOINTS, 2, n, misses=np.arange(n) % 4 == 1)
+    assert reference["hit"][:, 1].tolist() == [i % 4 != 1 for i in range(n)]
+    metrics, arrays = evaluate.evaluate(WAYPOINTS, policy, 2, n, reference)
+    ours = best = 0.0
+    chosen, second = [], 0
+    for i in range(n):
+        first_hit = np.hypot(*arrays["x"][i, 50]) <= 0.02
+        second_hit = np.hypot(*(arrays["x"][i, 100] - [0.5, 0.5])) <= 0.02
+        second += second_hit
+        assert first_hit and second_hit == (i % 3 != 0)
+        if first_hit and second_hit and i % 4 != 1:
+            chosen.append(i)
+            ours, best = ours + arrays["cost"][i], best + reference["cost"][i]
+    assert len(chosen) == 12
+    assert metrics["ratio_of_sums"] == pytest.approx(ours / best, rel=1e-12)
+    assert metrics["ratio_max"] == max(arrays["cost"][i] / reference["cost"][i] for i in chosen)
+    assert metrics["hit_rate"] == metrics["hit_rate_phase_2"] == second / n
+    assert metrics["hit_rate_phase_1"] == 1.0
+    assert metrics["cost_mean"] == pytest.approx(sum(arrays["cost"]) / n, rel=1e-12)  # the means: all starts
+    lines = evaluate.table(metrics).splitlines()
+    assert lines[2].split()[-1] == f"{metrics['ratio_of_sums']:.4f}"
+    assert [line.split()[-1] for line in lines[3:6]] == ["-"] * 3  # no ratio of parts of different starts
+
+
+@pytest.mark.parametrize("why", ["none hits", "no optimum hits"])
+def test_waypoints_without_a_comparable_start_have_no_ratio(why):
+    reference = reference_flight(WAYPOINTS, 2, 12, misses=why == "no optimum hits")
+    policy = lets_go(feedback(WAYPOINTS, 1e3), why == "none hits", 0)
+    metrics, arrays = evaluate.evaluate(WAYPOINTS, policy, 2, 12, reference)
+    assert metrics.keys() == COMMON | COSTS | HITS | {"hit_rate_phase_2"}
+    text = evaluate.table(metrics)
+    assert ("no start hit every circle" in text) == (why == "none hits")
+    assert "No cost ratio" in text and "nan" not in text.lower()
+    assert "no cost ratio" in evaluate.headline(metrics)
+
+
+@pytest.mark.parametrize("env_id, phases", [(id_, len(problem.phases)) for id_, problem in envs.PROBLEMS.items()])
+def test_keys_are_exactly_the_interfaces_and_plain(env_id, phases, tmp_path):
+    reference = reference_flight(env_id, 0, 12)
+    effort = 150.0 if env_id == "VanDerPolWaypoints-v0" else 2.0
+    metrics, arrays = evaluate.evaluate(env_id, feedback(env_id, 1e3, effort), 0, 12, reference)
+    extra = {f"hit_rate_phase_{k}" for k in range(2, phases + 1)}
+    assert metrics.keys() == COMMON | RATIOS | TEN_STARTS | COSTS | HITS | extra
+    assert {type(value) for value in metrics.values()} == {str, int, float}
+    assert all(np.isfinite(value) for value in metrics.values() if isinstance(value, float))
+    evaluate.write_json(tmp_path / "eval.json", metrics)
+    assert json.loads((tmp_path / "eval.json").read_text()) == metrics
+    assert arrays.keys() == ARRAYS
+    evaluate.write_npz(tmp_path / "eval.npz", arrays)
+    with np.load(tmp_path / "eval.npz") as file:
+        assert set(file.files) == ARRAYS
+        assert all(np.array_equal(file[key], arrays[key]) for key in ARRAYS)
+
+
+def test_arrays_hold_the_flight_and_not_the_next_episode():
+    n, T = 12, 50
+    reference = reference_flight(SINGLE, 4, n)
+    metrics, arrays = evaluate.evaluate(SINGLE, lambda obs, t: -30 * obs[:, :1] - 9 * obs[:, 1:2], 4, n, reference)
+    shapes = {"t": (T + 1,), "x": (n, T + 1, 2), "u": (n, T), "reward": (n, T), "cost": (n,)}
+    shapes |= {"x_reference": (n, T + 1, 2), "u_reference": (n, T), "cost_reference": (n,)}
+    assert {key: value.shape for key, value in arrays.items()} == shapes
+    assert arrays["t"] == pytest.approx(np.linspace(0, 5, T + 1))
+    x, u = arrays["x"], arrays["u"]
+    assert np.array_equal(x[:, 0], np.random.default_rng(4).uniform(-1, 1, (n, 2)))
+    assert np.abs(u).max() == 4.0 < np.abs(30 * x[:, 0, 0] + 9 * x[:, 0, 1]).max()
+    for x0, x1, v in zip(x[:, -2], x[:, -1], u[:, -1]):  # the exact discretisation leads to the last state
+        assert x1 == pytest.approx([x0[0] + 0.1 * x0[1] + 0.005 * v, x0[1] + 0.1 * v], abs=1e-12)
+
+
+def test_reference_of_other_starts_is_refused():
+    with pytest.raises(ValueError, match="12 starts of eval_seed 1"):
+        evaluate.evaluate(SINGLE, feedback(SINGLE, 20.0), 1, 12, reference_flight(SINGLE, 2, 12))
+    with pytest.raises(ValueError, match="12 starts of eval_seed 1"):
+        evaluate.evaluate(SINGLE, feedback(SINGLE, 20.0), 1, 12, reference_flight(SINGLE, 1, 13))
+
+
+def test_missing_reference_is_solved_and_options_reach_the_environment(monkeypatch):
+    asked, seen = [], []
+
+    def solve(env_id, x0):
+        asked.append((env_id, x0))
+        return reference_flight(SINGLE, 6, 10)
+
+    def policy(obs, t):
+        seen.append(obs[0, 2])
+        return np.zeros((len(obs), 1))
+
+    monkeypatch.setattr(evaluate.baselines, "reference", solve)
+    evaluate.evaluate(SINGLE, policy, 6, 10, observe_phase=False)
+    assert asked[0][0] == SINGLE and np.array_equal(asked[0][1], evaluate.starts(6, 10))
+    assert set(seen) == {0.0}
+
+
+def test_import_needs_neither_torch_nor_casadi_nor_pyplot():
+    code = "import evaluate, sys; print([m for m in ('torch', 'casadi', 'matplotlib.pyplot') if m in sys.modules])"
+    result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Table and files
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def test_table_shows_optimum_ours_and_ratio():
+    metrics, _ = evaluate.evaluate(SINGLE, feedback(SINGLE, 20.0, 2.0), 5, 20, reference_flight(SINGLE, 5, 20))
+    lines = evaluate.table(metrics).splitlines()
+    assert lines[1].split() == ["optimum", "ours", "ratio"]
+    for label, part in (("cost J (mean of 20 starts)", "cost"), ("of it: control", "cost_control")):
+        (line,) = (line for line in lines if label in line)
+        optimum, ours = metrics[f"reference_{part}_mean"], metrics[f"{part}_mean"]
+        assert line.split()[-3:] == [f"{optimum:.4f}", f"{ours:.4f}", f"{ours / optimum:.4f}"]
+    text = "\n".join(lines)
+    for key in RATIOS | TEN_STARTS:
+        assert f"{metrics[key]:.4f}" in text, key
+    assert "eval seed 5" in text
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), np.float64("nan")])
+def test_json_refuses_what_is_not_finite_and_keeps_the_old_file(bad, tmp_path):
+    path = tmp_path / "eval.json"
+    evaluate.write_json(path, {"seed": np.int64(1), "ratio_of_sums": np.float64(1.5)})
+    assert json.loads(path.read_text()) == {"seed": 1, "ratio_of_sums": 1.5}
+    before = snapshot(tmp_path)
+    with pytest.raises(ValueError, match="ratio_mean is"):
+        evaluate.write_json(path, {"seed": 2, "ratio_mean": bad})
+    assert snapshot(tmp_path) == before
+
+
+def test_failing_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):
+    path = tmp_path / "eval.npz"
+    evaluate.write_npz(path, {"x": np.arange(3)})
+    before = snapshot(tmp_path)
+
+    def break_off(file, **arrays):
+        file.write(b"half")
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(np, "savez_compressed", break_off)
+    with pytest.raises(OSError, match="no space left"):
+        evaluate.write_npz(path, {"x": np.arange(4)})
+    assert snapshot(tmp_path) == before
+    with pytest.raises(OSError):
+        evaluate.write_json(tmp_path / "no such folder" / "eval.json", {})
+
+
+def test_curve_of_a_resumed_run_keeps_the_last_value(tmp_path):
+    from torch.utils.tensorboard import SummaryWriter
+
+    for shift, steps in ((0.0, (100, 200, 300)), (0.5, (300, 400))):  # stopped after 300, resumed from 200
+        with SummaryWriter(tmp_path, filename_suffix=f".{shift}") as writer:
+            for step in steps:
+                writer.add_scalar("losses/policy_loss", step / 3 + shift, step)
+            writer.add_scalar("eval/ratio_mean", 1.0 + shift, steps[-1])
+    curve = evaluate.read_curve(tmp_path)
+    steps, values = curve["losses/policy_loss"]
+    assert steps.tolist() == [100, 200, 300, 400]
+    assert values == pytest.approx([100 / 3, 200 / 3, 100.5, 400 / 3 + 0.5], rel=1e-6)
+    path = tmp_path / "1.csv"
+    evaluate.write_csv(path, curve)
+    with open(path, newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["global_step"] for row in rows] == ["100", "200", "300", "400"]
+    assert [row["eval/ratio_mean"] for row in rows] == ["", "", "1", "1.5"]
+    assert path.read_text().startswith("global_step,")
+    again = evaluate.read_csv(path)
+    assert again.keys() == curve.keys()
+    for tag, (steps, values) in curve.items():
+        assert np.array_equal(again[tag][0], steps)
+        assert np.array_equal(again[tag][1].astype(np.float32), values.astype(np.float32))  # bit for bit
+    for text in ("step,loss\n1,2\n", "global_step,loss\n1\n", ""):
+        path.write_text(text)
+        with pytest.raises(ValueError, match="not a training curve"):
+            evaluate.read_csv(path)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Figures
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def test_figures_show_policy_optimum_targets_and_bounds():
+    reference = reference_flight(WAYPOINTS, 3, 12)
+    metrics, arrays = evaluate.evaluate(WAYPOINTS, feedback(WAYPOINTS, 1e3, effort=2.0), 3, 12, reference)
+    figure = evaluate.draw_trajectories(arrays, metrics)
+    plane, position, velocity, control = figure.axes
+    assert [(patch.center, patch.radius) for patch in plane.patches] == [((0.0, 0.0), 0.02), ((0.5, 0.5), 0.02)]
+    red = [line.get_ydata() for line in position.lines if line.get_color() == "tab:red"]
+    blue = [line.get_ydata() for line in position.lines if line.get_color() == "tab:blue"]
+    assert np.array_equal(red, arrays["x"][:10, :, 0]) and np.array_equal(blue, arrays["x_reference"][:10, :, 0])
+    assert any(np.array_equal(line.get_xdata(), [5.0, 5.0]) for line in control.lines), "the end of phase 1"
+    assert {line.get_ydata()[0] for line in control.lines if line.get_linestyle() == "--"} == {-3.0, 3.0}
+    assert all(ax.get_xlabel() and ax.get_ylabel() for ax in figure.axes)
+    assert f"{metrics['ratio_of_sums']:.4f}" in figure.get_suptitle() and WAYPOINTS in figure.get_suptitle()
+
+
+def test_cost_figure_shows_the_parts_and_marks_misses():
+    policy = lets_go(feedback(WAYPOINTS, 1e3, effort=1.3), np.arange(12) == 2, 90)
+    reference = reference_flight(WAYPOINTS, 3, 12)
+    metrics, arrays = evaluate.evaluate(WAYPOINTS, policy, 3, 12, reference)
+    figure = evaluate.draw_costs(arrays, metrics)
+    panels = {ax.get_ylabel(): ax for ax in figure.axes}
+    flown = envs.fly(WAYPOINTS, policy, evaluate.starts(3, 12))
+    for name in ("state", "control", "terminal"):
+        heights = [bar.get_height() for bar in panels[f"{name} cost"].patches]
+        assert heights == pytest.approx([*flown[f"cost_{name}"][:10], *reference[f"cost_{name}"][:10]])
+    labels = [text.get_text() for text in panels["total cost J"].texts]
+    expected = [f"{a / b:.3f}" for a, b in zip(arrays["cost"][:10], arrays["cost_reference"][:10])]
+    assert labels == [*expected[:2], "miss", *expected[3:]]
+
+
+def test_median_curve_ends_with_the_shortest_seed():
+    long = np.array([0, 10, 20, 30]), np.array([0.0, 1.0, 2.0, 3.0])
+    short = np.array([5, 15, 25]), np.array([2.0, 4.0, 6.0])
+    grid, median = evaluate.median_curve([long, short])
+    assert grid.tolist() == [10, 20]
+    assert median.tolist() == [(1 + 3) / 2, (2 + 5) / 2]
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Results folders
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def test_publish_ships_the_first_seed_and_adds_the_second(tmp_path, monkeypatch, capsys):
+    first, second = make_run(tmp_path / "a", seed=1), make_run(tmp_path / "b", seed=2, level=-1.0)
+    results = tmp_path / "results" / "di"
+    printed = command_line(monkeypatch, capsys, "publish", first, results)
+    assert "ratio" in printed and SINGLE in printed
+    names = {"agent.safetensors", "eval.json", "eval.npz", "seeds/1.json", "seeds/1.csv"}
+    names |= {f"figures/{name}.png" for name in ("training", "trajectories", "costs")}
+    files = snapshot(results)
+    assert {str(name) for name in files} == names
+    for name in ("agent.safetensors", "eval.json", "eval.npz"):
+        assert files[Path(name)] == (first / name).read_bytes()
+    assert files[Path("seeds/1.json")] == files[Path("eval.json")]
+    steps, returns = evaluate.read_csv(results / "seeds" / "1.csv")["charts/episodic_return"]
+    assert steps.tolist() == [4000 * update for update in range(1, 31)]
+    assert returns == pytest.approx([14 - 30 * 0.8**update for update in range(1, 31)], rel=1e-6)
+    for name, content in files.items():
+        if name.suffix == ".png":
+            assert content.startswith(b"\x89PNG") and content.rstrip().endswith(b"IEND\xaeB`\x82")
+            assert len(content) > 20_000, "an empty picture is smaller"
+
+    command_line(monkeypatch, capsys, "publish", second, results)
+    after = snapshot(results)
+    assert {str(name) for name in after} == names | {"seeds/2.json", "seeds/2.csv"}
+    assert {name: after[name] for name in files} == files
+    printed = command_line(monkeypatch, capsys, "figures", results)
+    assert "seed 1: ratio" in printed and "seed 2: ratio" in printed and "2 seeds: median" in printed
+    assert snapshot(results)[Path("figures/training.png")] != files[Path("figures/training.png")]
+    assert (results / "agent.safetensors").read_bytes() == b"weights of seed 1"
+
+    redrawn = []
+    monkeypatch.setattr(evaluate, "redraw", redrawn.append)
+    command_line(monkeypatch, capsys, "publish", second, results, "--ship")
+    assert redrawn == [results]
+    assert (results / "agent.safetensors").read_bytes() == b"weights of seed 2"
+    assert json.loads((results / "eval.json").read_text())["seed"] == 2
+
+
+def test_figures_of_a_run_folder(tmp_path, monkeypatch, capsys):
+    run = make_run(tmp_path / "run", env_id=WAYPOINTS)
+    printed = command_line(monkeypatch, capsys, "figures", run)
+    assert "circle 2" in printed and str(run / "figures" / "costs.png") in printed
+    assert {path.name for path in (run / "figures").iterdir()} == {"training.png", "trajectories.png", "costs.png"}
+
+
+def spoil(run, fault):
+    """Damage a run folder in one way."""
+    if fault == "no events":
+        for path in run.glob("events*"):
+            path.unlink()
+    elif fault in ("agent.safetensors", "eval.json", "eval.npz"):
+        (run / fault).unlink()
+    elif fault == "truncated npz":
+        (run / "eval.npz").write_bytes((run / "eval.npz").read_bytes()[:200])
+    elif fault == "broken json":
+        (run / "eval.json").write_text('{"env_id": ')
+    elif fault == "other weights":
+        (run / "agent.safetensors").write_bytes(b"other")
+    else:
+        metrics = json.loads((run / "eval.json").read_text())
+        changes = {"other env": {"env_id": "VanDerPol-v0"}, "unknown env": {"env_id": "Pendulum-v1"}}
+        metrics |= changes.get(fault, {"seed": "../1"})
+        (run / "eval.json").write_text(json.dumps(metrics))
+
+
+FAULTS = {
+    "agent.safetensors": "agent.safetensors",
+    "eval.json": "eval.json",
+    "eval.npz": "eval.npz",
+    "no events": "no TensorBoard scalars",
+    "truncated npz": "not a readable .npz",
+    "broken json": "not readable JSON",
+    "other weights": "checkpoint_sha256",
+    "other env": "VanDerPol-v0",
+    "unknown env": "env_id must be one of",
+    "bad seed": "seed is '../1'",
+    "shipped seed": "--ship",
+}
+
+
+def test_refused_publishing_leaves_the_folder_untouched(tmp_path, monkeypatch, capsys):
+    results = tmp_path / "results"
+    good = make_run(tmp_path / "good", seed=1)
+    monkeypatch.setattr(evaluate, "redraw", lambda folder: [])  # drawing is tested above
+    command_line(monkeypatch, capsys, "publish", good, results)
+    before = snapshot(results)
+    for fault, message in FAULTS.items():
+        run = tmp_path / fault
+        run.mkdir()
+        for path in good.iterdir():
+            (run / path.name).write_bytes(path.read_bytes())
+        if fault != "shipped seed":
+            metrics = json.loads((run / "eval.json").read_text())
+            (run / "eval.json").write_text(json.dumps({**metrics, "seed": 2}))
+            spoil(run, fault)
+        with pytest.raises(SystemExit) as refusal:
+            command_line(monkeypatch, capsys, "publish", run, results)
+        assert message in str(refusal.value) and "\n" not in str(refusal.value), fault
+        assert snapshot(results) == before, fault
+    with pytest.raises(SystemExit, match="eval.json"):
+        command_line(monkeypatch, capsys, "publish", tmp_path / "eval.json", tmp_path / "new")
+    assert not (tmp_path / "new").exists()
