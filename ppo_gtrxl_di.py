@@ -3,7 +3,6 @@
     python ppo_gtrxl_di.py --seed 1                                            # Table 1 of the paper
     python ppo_gtrxl_di.py --seed 1 --env-id DoubleIntegratorWaypoints-v0      # two waypoints, one policy
     python ppo_gtrxl_di.py --eval-only --checkpoint results/di/agent.safetensors
-    tensorboard --logdir runs
 
 Top to bottom: arguments (Table 1), problem, Gated Transformer-XL, agent, PPO, checkpoints, main. From the first
 "Shared" on, all ppo_gtrxl_*.py are the same to the letter. T steps, N environments, L memory, d width, H heads.
@@ -78,7 +77,7 @@ class Args:
     learning_rate_final: float = 3e-5  # learning rate of the last update (linear in between)
     gamma: float = 0.99  # the discount factor gamma
     gae_lambda: float = 0.95  # the lambda for the general advantage estimation
-    num_minibatches: int = 8  # the number of mini-batches of whole episodes
+    num_minibatches: int = 4  # the number of mini-batches of whole episodes
     update_epochs: int = 8  # the K epochs to update the policy
     norm_adv: bool = True  # normalise the advantages over an update
     clip_coef: float = 0.2  # the surrogate clipping coefficient
@@ -110,22 +109,21 @@ def describe(episodes):
 
 
 # Shared: Gated Transformer-XL ("Gated Transformer-XL Implementation") -------------------------------------------------
-def linear(inputs, outputs, gain=1.0, bias=True):
-    """A linear layer with orthogonal weights and zero bias (CleanRL's layer_init)."""
-    layer = nn.Linear(inputs, outputs, bias=bias)
+def linear(inputs, outputs, gain=1.0, bias=0.0):
+    """A linear layer with orthogonal weights and a constant bias (CleanRL's layer_init), or without one (None)."""
+    layer = nn.Linear(inputs, outputs, bias=bias is not None)
     nn.init.orthogonal_(layer.weight, gain)
-    if bias:
-        nn.init.zeros_(layer.bias)
+    if bias is not None:
+        nn.init.constant_(layer.bias, bias)
     return layer
 
 
 class Gate(nn.Module):
     """gate(x, y) = lambda x + (1 - lambda) y, lambda = sigmoid(W_g [x, y] + b_g); b_g > 0 begins near the identity."""
 
-    def __init__(self, embed_dim, bias=2.0):
+    def __init__(self, embed_dim):
         super().__init__()
-        self.linear = linear(2 * embed_dim, embed_dim)
-        nn.init.constant_(self.linear.bias, bias)
+        self.linear = linear(2 * embed_dim, embed_dim, bias=2.0)
 
     def forward(self, x, y):
         lam = torch.sigmoid(self.linear(torch.cat([x, y], dim=-1)))
@@ -135,19 +133,19 @@ class Gate(nn.Module):
 class RelativeAttention(nn.Module):
     """Multi-head attention over a sliding window: A_ij = (x_i W^Q) (x_j W^K + R_{i-j})^T / sqrt(d_k), i - L <= j <= i.
 
-    R is learned, one vector for each head and distance 0..L. Index j runs over [memory; segment].
+    R is learned, one vector for each head and distance 0..L; j runs over [memory; segment].
     """
 
     def __init__(self, embed_dim, num_heads, memory_length):
         super().__init__()
         self.num_heads, self.memory_length, self.dk = num_heads, memory_length, embed_dim // num_heads
-        self.query, self.key, self.value, self.out = (linear(embed_dim, embed_dim, bias=False) for _ in range(4))
+        self.query, self.key, self.value, self.out = (linear(embed_dim, embed_dim, bias=None) for _ in range(4))
         self.R = nn.Parameter(torch.zeros(num_heads, memory_length + 1, self.dk))
 
     def forward(self, x, memory):
         """The whole segment at once: x (N, T, d), memory (N, L, d) -> (N, T, d).
 
-        Queries are cut into chunks of C <= L steps, each against its own window of L + C keys: linear in T.
+        Queries in chunks of C steps, about L, each against its own window of L + C keys: linear in T.
         """
         (N, T, d), L, H, dk = x.shape, self.memory_length, self.num_heads, self.dk
         chunks = math.ceil(T / max(L, 16))
@@ -252,8 +250,7 @@ class Agent(nn.Module):
         logstd = self.actor_logstd.clamp(-5.0, 0.5)
         mean = self.get_mean_action(hidden)
         probs = Normal(mean, logstd.exp().expand_as(mean), validate_args=False)
-        if action is None:
-            action = probs.sample()
+        action = probs.sample() if action is None else action
         return action, probs.log_prob(action).sum(-1), probs.entropy().sum(-1), self.critic(hidden).squeeze(-1)
 
 
@@ -457,9 +454,8 @@ def restore(state, agent, average, optimizer, envs):
 
 def load_state(run_dir):
     """The training state of a run folder; one line if there is none, or it is damaged or another script's."""
-    path = Path(run_dir) / "training_state.pt"
     try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
+        state = torch.load(Path(run_dir) / "training_state.pt", map_location="cpu", weights_only=True)
         if state["args"].keys() != asdict(Args()).keys() or state["args"]["env_id"] not in ENV_IDS:
             raise ValueError("of another script")
     except Exception as error:  # a missing, damaged or foreign file fails in many ways, all alike to the user
@@ -553,8 +549,7 @@ def train(args, agent, average, envs, writer, run_dir, saved):
 
 def run(args, agent, envs, saved):
     """Train (or go on), save, evaluate, print the table."""
-    name = f"{args.env_id}__{args.exp_name}__{args.seed}__{int(time.time())}"
-    run_dir = Path("runs") / name if args.resume is None else Path(args.resume)
+    run_dir = Path(args.resume or f"runs/{args.env_id}__{args.exp_name}__{args.seed}__{int(time.time())}")
     if args.track:
         import wandb
 
@@ -562,8 +557,7 @@ def run(args, agent, envs, saved):
         wandb.init(**names, sync_tensorboard=True, config=asdict(args), save_code=True)
     run_dir.mkdir(parents=True, exist_ok=True)
     evaluate.write_json(run_dir / "args.json", asdict(args))
-    logged = 0 if args.resume is None else saved["progress"]["global_step"]  # what came later is flown again
-    writer = SummaryWriter(run_dir, purge_step=logged + 1)
+    writer = SummaryWriter(run_dir, purge_step=1 + (saved["progress"]["global_step"] if args.resume else 0))
     average = AveragedModel(agent, multi_avg_fn=get_ema_multi_avg_fn(args.weight_average))
     state = train(args, agent, average, envs, writer, run_dir, saved)
     if args.save_model:
