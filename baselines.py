@@ -18,6 +18,7 @@ import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from functools import cache
 from multiprocessing import get_context
 from pathlib import Path
@@ -351,19 +352,23 @@ def report(args) -> None:
     for key, value in numbers.items():
         print(f"{key:<32}{value if isinstance(value, str) else format(value, '.7g')}")
     if args.json:
-        write(args.json, lambda file: file.write(json.dumps(numbers, indent=1).encode()))
+        with replacing(args.json, "w") as file:
+            json.dump(numbers, file, indent=2)
     if args.npz:
         arrays = {f"{key}_reference": flight[key] for key in ("x", "u", "cost")}
-        write(args.npz, lambda file: np.savez(file, t=PROBLEMS[env_id].dt * np.arange(flight["x"].shape[1]), **arrays))
+        with replacing(args.npz) as file:
+            np.savez_compressed(file, t=PROBLEMS[env_id].dt * np.arange(flight["x"].shape[1]), **arrays)
 
 
-def write(path: Path, fill: Callable) -> None:
-    """Let `fill(file)` write a binary file under a temporary name, then rename it: `path` is whole or untouched."""
-    temporary = path.with_name(f"{path.name}.tmp")
+@contextmanager
+def replacing(path, mode: str = "wb"):
+    """Open a temporary file that becomes `path` when the block ends without an error: whole or untouched."""
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        with temporary.open("wb") as file:
-            fill(file)
-        temporary.replace(path)
+        with open(temporary, mode, newline=None if "b" in mode else "") as file:
+            yield file
+        os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
 

@@ -14,10 +14,9 @@ import csv
 import hashlib
 import json
 import math
-import os
 import sys
 import zipfile
-from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +28,7 @@ from matplotlib.ticker import EngFormatter
 
 import baselines
 import envs
+from baselines import replacing
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Cases and ratios
@@ -42,16 +42,22 @@ def starts(seed: int, n: int) -> np.ndarray:
     return np.random.default_rng(seed).uniform(-1, 1, (n, 2))
 
 
+@lru_cache(maxsize=4)  # evaluations during training fly the same starts again and again
+def optimum(env_id: str, eval_seed: int, n: int) -> dict:
+    """`baselines.reference` from the n starts of a seed."""
+    return baselines.reference(env_id, starts(eval_seed, n))
+
+
 def evaluate(env_id, policy, eval_seed: int, n: int, reference: dict | None = None, **env_options):
     """Fly `policy(obs (n, obs), t) -> action (n, 1)` from n starts and compare it, start by start, with the optimum.
 
-    `reference` is `baselines.reference(env_id, starts(eval_seed, n))`, solved here when it is not given; `env_options`
+    `reference` is `optimum(env_id, eval_seed, n)`, solved here when it is not given; `env_options`
     go to the environment. Returns the `metrics` of eval.json that do not depend on the run, as plain numbers, and the
     `arrays` of eval.npz. Raises ValueError if the reference belongs to other starts.
     """
     x0 = starts(eval_seed, n)
     flight = envs.fly(env_id, policy, x0, **env_options)
-    reference = baselines.reference(env_id, x0) if reference is None else reference
+    reference = optimum(env_id, eval_seed, n) if reference is None else reference
     if not np.array_equal(reference["x"][:, 0], x0):
         raise ValueError(f"reference does not belong to the {n} starts of eval_seed {eval_seed}")
     metrics = {"env_id": env_id, "eval_seed": eval_seed, "eval_starts": n}
@@ -158,7 +164,7 @@ def table(metrics: dict) -> str:
         rows.append((label, "", f"{metrics[f'hit_rate_phase_{k}']:.1%}", ""))
     width = max(len(row[0]) for row in rows)
     lines = [f"{metrics['env_id']}: {metrics['eval_starts']} starts of eval seed {metrics['eval_seed']}"]
-    lines += [(f"  {row[0]:<{width}}" + "".join(f"{cell:>11}" for cell in row[1:])).rstrip() for row in rows]
+    lines += [(f"  {row[0]:<{width}}" + "".join(f" {cell:>11}" for cell in row[1:])).rstrip() for row in rows]
     return "\n".join([*lines, *ratio_lines(metrics)])
 
 
@@ -186,19 +192,6 @@ def ratio_lines(metrics: dict) -> list[str]:
 
 class BadInput(ValueError):
     """A file or value that a user gave and nothing can be done with; its message is the one line that is shown."""
-
-
-@contextmanager
-def replacing(path, mode: str = "wb"):
-    """Open a temporary file that becomes `path` when the block ends without an error. Raises OSError."""
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with open(temporary, mode, newline=None if "b" in mode else "") as file:
-            yield file
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def write_bytes(path, data: bytes):

@@ -86,7 +86,7 @@ class Args:
     vf_coef: float = 0.2  # coefficient of the value function
     max_grad_norm: float = 0.5  # the maximum norm for the gradient clipping
     target_kl: float | None = None  # the target KL divergence threshold that ends an update's epochs
-    log_std: float = -0.5  # initial log of the policy's standard deviation, in the action's unit
+    log_std: float = 0.0  # initial log of the policy's standard deviation, in the action's unit
     weight_average: float = 0.998  # decay of the averaged weights used in evaluation (0: off)
 
 

@@ -300,12 +300,9 @@ def test_failed_write_leaves_the_old_file(tmp_path):
     path = tmp_path / "a.json"
     path.write_text("old")
 
-    def breaks_off(file):
+    with pytest.raises(OSError, match="disk full"), baselines.replacing(path) as file:
         file.write(b"half")
         raise OSError("disk full")
-
-    with pytest.raises(OSError, match="disk full"):
-        baselines.write(path, breaks_off)
     assert path.read_text() == "old" and [file.name for file in tmp_path.iterdir()] == ["a.json"]
 
 

@@ -1,0 +1,45 @@
+"""What several test files share: a vector environment whose episodes end at different times."""
+
+import numpy as np
+import pytest
+from gymnasium.spaces import Box
+
+
+class UnevenEnvs:
+    """N environments with SAME_STEP autoreset: episodes of environment i last lengths[i] steps.
+
+    Observations are random; the reward is a function of the action. Everything given and taken is kept for the test.
+    """
+
+    def __init__(self, lengths, spare_steps=0, reward=lambda action: action[:, 0], u_max=(4.0,)):
+        self.lengths, self.num_envs = np.array(lengths), len(lengths)
+        self.episode_steps = max(lengths) + spare_steps
+        high = np.array(u_max)
+        self.single_observation_space, self.single_action_space = Box(-1, 1, (3,)), Box(-high, high, dtype=np.float64)
+        self.reward, self.rng = reward, np.random.default_rng(0)
+
+    def _draw(self):
+        self.given_obs.append(self.rng.uniform(-1, 1, (self.num_envs, 3)))
+        return self.given_obs[-1]
+
+    def reset(self, seed=None):
+        self.t, self.sums = np.zeros(self.num_envs, dtype=int), np.zeros(self.num_envs)
+        self.given_obs, self.taken_actions, self.given_rewards = [], [], []
+        return self._draw(), {}
+
+    def step(self, actions):
+        self.taken_actions.append(actions.copy())
+        self.given_rewards.append(np.asarray(self.reward(actions), dtype=np.float64))
+        self.t, self.sums = self.t + 1, self.sums + self.given_rewards[-1]
+        terminated, info = self.t == self.lengths, {}
+        if terminated.any():
+            # where no episode ended, the arrays hold something else on purpose
+            returns = np.where(terminated, self.sums, -1e6)
+            info["final_info"] = {"episodic_return": returns, "_episodic_return": terminated.copy()}
+            self.t, self.sums = np.where(terminated, 0, self.t), np.where(terminated, 0.0, self.sums)
+        return self._draw(), self.given_rewards[-1], terminated, np.zeros(self.num_envs, dtype=bool), info
+
+
+@pytest.fixture
+def uneven_envs():
+    return UnevenEnvs
