@@ -278,8 +278,7 @@ def rollout(agent, envs, reward_scale, memory_noise):
     obs, actions = zeros(*envs.single_observation_space.shape), zeros(*envs.single_action_space.shape)
     batch = Batch(obs, actions, *(zeros() for _ in range(4)), agent.new_memory(N, memory_noise))
     cache = agent.start_cache(batch.memory, T)
-    alive, episodes = np.ones(N, dtype=bool), {}
-    next_obs, _ = envs.reset()
+    alive, episodes, (next_obs, _) = np.ones(N, dtype=bool), {}, envs.reset()
     for t in range(T):
         batch.obs[t], batch.alive[t] = torch.as_tensor(next_obs), torch.as_tensor(alive)
         hidden = agent.encode_step(batch.obs[t], cache, t)
@@ -314,9 +313,8 @@ def ppo_loss(agent, batch, mb, args, ent_coef):
     _, newlogprob, entropy, newvalue = agent.get_action_and_value(hidden, batch.actions[:, mb])
     logratio = newlogprob - batch.logprobs[:, mb]
     ratio = logratio.exp()
-    pg_loss1 = -advantages * ratio
-    pg_loss2 = -advantages * torch.clamp(ratio, 1 - args.clip_coef, 1 + args.clip_coef)
-    pg_loss = mean(torch.max(pg_loss1, pg_loss2))
+    clipped = torch.clamp(ratio, 1 - args.clip_coef, 1 + args.clip_coef)
+    pg_loss = mean(torch.max(-advantages * ratio, -advantages * clipped))
     v_loss = mean(0.5 * (newvalue - batch.returns[:, mb]) ** 2)
     entropy_loss = mean(entropy)
     loss = pg_loss - ent_coef * entropy_loss + args.vf_coef * v_loss
@@ -353,8 +351,8 @@ def update(agent, average, optimizer, batch, args, ent_coef):
             log.append(losses)
         if args.target_kl is not None and losses["approx_kl"] > args.target_kl:
             break
-    means = {name: torch.stack([losses[name] for losses in log]).mean().item() for name in log[0]}
-    return {**means, "explained_variance": explained_variance.item()}
+    means = {name: torch.stack([losses[name] for losses in log]).mean() for name in losses}
+    return {name: value.item() for name, value in {**means, "explained_variance": explained_variance}.items()}
 
 
 def linear_schedule(first, last, iteration, total):
@@ -365,8 +363,7 @@ def linear_schedule(first, last, iteration, total):
 # Shared: arguments ----------------------------------------------------------------------------------------------------
 
 RANGES = {  # lowest and highest value of every numeric flag; NaN and infinity are outside
-    **dict.fromkeys(["seed", "eval_seed"], (0, 2**31 - 1)),
-    **dict.fromkeys(["num_threads", "eval_every"], (0, 10**6)),
+    **dict.fromkeys(["seed", "eval_seed", "num_threads", "eval_every"], (0, 2**31 - 1)),
     **dict.fromkeys(["total_updates", "num_envs", "num_minibatches", "update_epochs"], (1, 10**6)),
     **dict.fromkeys(["embed_dim", "num_heads", "mlp_dim", "hidden_dim"], (1, 8192)),
     **dict.fromkeys(["learning_rate", "learning_rate_final", "clip_coef", "weight_average"], (0.0, 1.0)),
@@ -440,16 +437,17 @@ def training_state(args, agent, average, optimizer, envs, progress):
     modules = {"agent": agent.state_dict(), "average": average.state_dict(), "optimizer": optimizer.state_dict()}
     rng = {"torch": torch.get_rng_state(), "envs": json.dumps(envs.np_random.bit_generator.state)}
     rng["cuda"] = torch.cuda.get_rng_state_all()
-    return copy.deepcopy({"args": asdict(args), "progress": progress, "rng": rng, **modules})
+    return copy.deepcopy({"args": {**asdict(args), "resume": None}, "progress": progress, "rng": rng, **modules})
 
 
 def restore(state, agent, average, optimizer, envs):
-    """Put everything back where `training_state` found it."""
+    """Put everything back where `training_state` found it; returns the progress."""
     for name, module in (("agent", agent), ("average", average), ("optimizer", optimizer)):
         module.load_state_dict(state[name])
     torch.set_rng_state(state["rng"]["torch"])
     torch.cuda.set_rng_state_all(state["rng"]["cuda"][: torch.cuda.device_count()])
     envs.np_random.bit_generator.state = json.loads(state["rng"]["envs"])
+    return state["progress"]
 
 
 def load_state(run_dir):
@@ -518,32 +516,31 @@ def train(args, agent, average, envs, writer, run_dir, saved):
     optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
     progress = {"seed": args.seed, "total_updates": 0, "global_step": 0, "wall_seconds": 0.0}
     if args.resume is not None:
-        restore(saved, agent, average, optimizer, envs)
-        progress = saved["progress"]
+        progress = restore(saved, agent, average, optimizer, envs)
     state = training_state(args, agent, average, optimizer, envs, progress)
-    for iteration in range(progress["total_updates"] + 1, args.total_updates + 1):
-        start, span = time.time(), (iteration, args.total_updates)
-        learning_rate = linear_schedule(args.learning_rate, args.learning_rate_final, *span)
-        ent_coef = linear_schedule(args.ent_coef, args.ent_coef_final, *span)
-        optimizer.param_groups[0]["lr"] = learning_rate
-        set_curriculum(envs, args, linear_schedule(0.0, 1.0, *span))
-        try:
+    try:
+        for iteration in range(progress["total_updates"] + 1, args.total_updates + 1):
+            start, span = time.time(), (iteration, args.total_updates)
+            learning_rate = linear_schedule(args.learning_rate, args.learning_rate_final, *span)
+            optimizer.param_groups[0]["lr"] = learning_rate
+            ent_coef = linear_schedule(args.ent_coef, args.ent_coef_final, *span)
+            set_curriculum(envs, args, linear_schedule(0.0, 1.0, *span))
             batch, episodes = rollout(agent, envs, args.reward_scale, args.memory_noise)
             losses = update(agent, average, optimizer, batch, args, ent_coef)
-        except KeyboardInterrupt:
-            return state
-        except FloatingPointError as error:
-            fail(f"update {iteration}: {error}; the last good checkpoint is in {run_dir}")
-        progress = {**progress, "total_updates": iteration}
-        progress["global_step"] += int(batch.alive.sum())
-        progress["wall_seconds"] += time.time() - start
-        state = training_state(args, agent, average, optimizer, envs, progress)
-        log_update(writer, args, progress, batch, episodes, losses, learning_rate)
-        if args.save_model and iteration % SAVE_EVERY == 0:
-            save_run(run_dir, state)
-        if args.eval_every and iteration % args.eval_every == 0:
-            metrics, _ = evaluate_agent(average.module, args, envs, TRAINING_EVAL_SEED, progress)
-            log_scalars(writer, "eval", metrics, progress["global_step"])
+            progress = {**progress, "total_updates": iteration}
+            progress["global_step"] += int(batch.alive.sum())
+            progress["wall_seconds"] += time.time() - start
+            state = training_state(args, agent, average, optimizer, envs, progress)
+            log_update(writer, args, progress, batch, episodes, losses, learning_rate)
+            if args.save_model and iteration % SAVE_EVERY == 0:
+                save_run(run_dir, state)
+            if args.eval_every and iteration % args.eval_every == 0:
+                metrics, _ = evaluate_agent(average.module, args, envs, TRAINING_EVAL_SEED, progress)
+                log_scalars(writer, "eval", metrics, progress["global_step"])
+    except KeyboardInterrupt:
+        print("interrupted: saving the last whole update")
+    except FloatingPointError as error:
+        fail(f"update {iteration}: {error}; it must be finite. The last good checkpoint is in {run_dir}")
     return state
 
 

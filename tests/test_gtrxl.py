@@ -219,7 +219,7 @@ def test_gate_at_infinite_bias():
 
 def test_initialisation():
     """R is zero, the gates' bias 2, other biases zero, weights orthogonal with CleanRL's gains."""
-    agent = make_agent(plain=True, num_blocks=3, memory_length=6)
+    agent = make_agent(plain=True, num_blocks=3, memory_length=6, log_std=-0.75)
     layers = {name: layer for name, layer in agent.named_modules() if isinstance(layer, torch.nn.Linear)}
     gains = {"encoder.0": 2**0.5, "actor.0": 2**0.5, "critic.0": 2**0.5, "actor.2": 0.01}
     for name, layer in layers.items():
@@ -233,7 +233,7 @@ def test_initialisation():
         projections = (block.attention.query, block.attention.key, block.attention.value, block.attention.out)
         assert all(layer.bias is None for layer in projections)
     assert len(layers) == 1 + 3 * 8 + 4  # encoder; four projections, two gates, two of the MLP a block; two a head
-    assert agent.actor_logstd.tolist() == [-0.5]
+    assert agent.actor_logstd.tolist() == [-0.75]
 
 
 def test_nothing_is_shared_between_blocks():

@@ -17,6 +17,7 @@ import ppo_gtrxl_di as script
 
 torch.set_num_threads(1)
 TINY = {"embed_dim": 8, "num_heads": 2, "mlp_dim": 8, "hidden_dim": 8, "num_blocks": 1, "memory_length": 4}
+TINY |= {"log_std": -0.5}
 
 
 def make_args(**changes):

@@ -140,7 +140,7 @@ TABLE_1 = {
     "clip_coef": (0.2, 0.2),
 }
 # INTERFACE and DECISIONS: what the paper does not give
-OURS = {"num_envs": (80, 117), "radius_curriculum": (12, 6), "log_std": (-0.5, -0.5), "memory_noise": (0.1, 0.1)}
+OURS = {"num_envs": (80, 117), "radius_curriculum": (12, 6), "memory_noise": (0.1, 0.1)}
 OURS |= {"reward_scale": (0.1, 0.1), "max_grad_norm": (0.5, 0.5), "env_id": ("DoubleIntegrator-v0", "VanDerPol-v0")}
 OURS |= {"save_model": (True, True), "observe_phase": (True, True), "norm_adv": (True, True)}
 
