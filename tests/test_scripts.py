@@ -401,6 +401,16 @@ def test_same_seed_twice(fresh_folder):
     assert not torch.equal(states[0]["agent"]["actor.0.weight"], states[2]["agent"]["actor.0.weight"])
 
 
+def test_seed_draws_the_first_weights(fresh_folder):
+    """With learning rate 0 the weights stay those of the start: another seed, other weights."""
+    weights = []
+    for seed in (3, 4):
+        fresh_folder(f"seed_{seed}")
+        DI.main([*TINY, "--total-updates=1", "--learning-rate=0", "--learning-rate-final=0", f"--seed={seed}"])
+        weights.append(state_of(run_folder())["agent"]["actor.0.weight"])
+    assert not torch.equal(*weights)
+
+
 @pytest.fixture(scope="module")
 def uninterrupted(tmp_path_factory):
     """The state and scalars after 4 updates in one go."""
@@ -425,7 +435,7 @@ def assert_resumes(uninterrupted):
         assert resumed[key] == metrics[key], key
     for tag, values in scalars(run).items():
         if tag not in ("charts/SPS", "eval/wall_seconds"):
-            assert dict(values) == dict(curve[tag]), tag
+            assert values == curve[tag], tag  # no step twice
 
 
 def test_ctrl_c_and_resume(uninterrupted, fresh_folder, monkeypatch, capsys):
@@ -513,6 +523,11 @@ def refuses(tmp_path, monkeypatch, capsys):
     folder = tmp_path / "here"
     folder.mkdir()
     monkeypatch.chdir(folder)
+
+    def trains(optimizer):
+        pytest.fail("the script trains")  # at once, instead of after a thousand updates
+
+    monkeypatch.setattr(torch.optim.Adam, "step", trains)
 
     def start(*argv, script=DI):
         before = files(tmp_path)
