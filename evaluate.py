@@ -238,6 +238,8 @@ def read_checkpoint(path, expected: dict[str, type]) -> dict:
         wrong = [name for name, kind in expected.items() if type(args[name]) is not kind]
         counters = {"seed": int, "total_updates": int, "global_step": int, "wall_seconds": float}
         progress = {name: kind(metadata[name]) for name, kind in counters.items()}
+        if not all(math.isfinite(value) and value >= 0 for value in progress.values()):
+            raise ValueError(f"its counters are {progress}")
     except OSError as error:
         raise BadInput(f"--checkpoint {path}: {error.strerror}; it must be an agent.safetensors") from error
     except (safetensors.SafetensorError, KeyError, TypeError, ValueError) as error:

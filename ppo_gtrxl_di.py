@@ -145,7 +145,7 @@ class RelativeAttention(nn.Module):
     def forward(self, x, memory):
         """The whole segment at once: x (N, T, d), memory (N, L, d) -> (N, T, d).
 
-        Queries in chunks of C steps, about L, each against its own window of L + C keys: linear in T.
+        Queries in chunks of C <= max(L, 16) steps, each against its own window of L + C keys: linear in T.
         """
         (N, T, d), L, H, dk = x.shape, self.memory_length, self.num_heads, self.dk
         chunks = math.ceil(T / max(L, 16))
@@ -161,13 +161,11 @@ class RelativeAttention(nn.Module):
     def position_scores(self, q):
         """q_i R_{i-j}^T of q (N, chunks, H, C, dk) under the keys of its window, -inf elsewhere: (..., C, L + C).
 
-        Row i's L + 1 products belong under keys i..i+L (distance L..0): padded with C columns of -inf, flattened and
-        cut into rows of L + C, every row has moved right by its index.
+        Row i belongs under keys i..i+L (distance L..0): padded with C times -inf and cut anew, it moves right by i.
         """
         C, L = q.shape[-2], self.memory_length
-        products = torch.einsum("nchqd,hld->nchql", q, self.R.flip(1))  # (..., C, L + 1)
-        padded = F.pad(products, (0, C), value=-torch.inf).flatten(-2)
-        return padded[..., : C * (L + C)].unflatten(-1, (C, L + C))
+        products = F.pad(torch.einsum("nchqd,hld->nchql", q, self.R.flip(1)), (0, C), value=-torch.inf)
+        return products.flatten(-2)[..., : C * (L + C)].unflatten(-1, (C, L + C))
 
     def start_cache(self, memory, steps):
         """Keys and values of the memory (N, L, d), with room for `steps` more: (2, N, H, L + steps, dk)."""
@@ -219,8 +217,8 @@ class Agent(nn.Module):
 
     def new_memory(self, num_envs, noise):
         """m_0 ~ N(0, noise^2), drawn once per episode and block: (blocks, N, L, d)."""
-        shape = self.num_blocks, num_envs, self.memory_length, self.embed_dim
-        return self.actor_logstd.new_empty(shape).normal_(std=noise)
+        zeros = self.actor_logstd.new_zeros(self.num_blocks, num_envs, self.memory_length, self.embed_dim)
+        return zeros.normal_(std=noise) if noise else zeros  # an evaluation must not move the random stream
 
     def encode(self, obs, memory):
         """Whole episodes in parallel (training): obs (N, T, obs), memory (blocks, N, L, d) -> hidden (N, T, d)."""
@@ -274,9 +272,8 @@ class Batch:
 def rollout(agent, envs, reward_scale, memory_noise):
     """One episode in each environment (Algorithm 1, lines 4-11): the Batch and the episodes' `final_info`."""
     T, N, like = envs.episode_steps, envs.num_envs, agent.actor_logstd
-    zeros = lambda *shape: like.new_zeros(T, N, *shape)  # noqa: E731
-    obs, actions = zeros(*envs.single_observation_space.shape), zeros(*envs.single_action_space.shape)
-    batch = Batch(obs, actions, *(zeros() for _ in range(4)), agent.new_memory(N, memory_noise))
+    shapes = envs.single_observation_space.shape, envs.single_action_space.shape, (), (), (), ()
+    batch = Batch(*(like.new_zeros(T, N, *shape) for shape in shapes), agent.new_memory(N, memory_noise))
     cache = agent.start_cache(batch.memory, T)
     alive, episodes, (next_obs, _) = np.ones(N, dtype=bool), {}, envs.reset()
     for t in range(T):
@@ -289,8 +286,6 @@ def rollout(agent, envs, reward_scale, memory_noise):
         for key, value in info.get("final_info", {}).items():
             episodes.setdefault(key, value.copy())[ended] = value[ended]
         alive = alive & ~terminated  # an ended environment has started anew; only its first episode counts
-        if not alive.any():
-            break
     return batch, episodes
 
 
@@ -328,7 +323,7 @@ def ppo_loss(agent, batch, mb, args, ent_coef):
 def update(agent, average, optimizer, batch, args, ent_coef):
     """K epochs of minibatches of whole episodes (Algorithm 1, lines 14-19); returns the mean of each logged loss.
 
-    Raises FloatingPointError, before the optimiser moves the weights, when a loss is not finite.
+    Raises FloatingPointError, before the optimiser moves the weights, when a loss or the gradient is not finite.
     """
     batch.advantages, batch.returns = gae(batch.rewards, batch.values, batch.alive, args.gamma, args.gae_lambda)
     valid, log = batch.alive.bool(), []
@@ -340,12 +335,12 @@ def update(agent, average, optimizer, batch, args, ent_coef):
         order = torch.randperm(batch.alive.shape[1], device=batch.alive.device)
         for minibatch, mb in enumerate(order.tensor_split(args.num_minibatches)):
             loss, losses = ppo_loss(agent, batch, mb, args, ent_coef)
-            if not torch.isfinite(loss):
-                bad = next(name for name, value in losses.items() if not torch.isfinite(value))
-                raise FloatingPointError(f"{bad} is {losses[bad]} in epoch {epoch + 1}, minibatch {minibatch + 1}")
             optimizer.zero_grad()
             loss.backward()
-            nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
+            norm = nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
+            for name, value in {**losses, "gradient norm": norm}.items():
+                if not value.isfinite():
+                    raise FloatingPointError(f"{name} is {value} in epoch {epoch + 1}, minibatch {minibatch + 1}")
             optimizer.step()
             average.update_parameters(agent)
             log.append(losses)
@@ -361,17 +356,15 @@ def linear_schedule(first, last, iteration, total):
 
 
 # Shared: arguments ----------------------------------------------------------------------------------------------------
-
 RANGES = {  # lowest and highest value of every numeric flag; NaN and infinity are outside
     **dict.fromkeys(["seed", "eval_seed", "num_threads", "eval_every"], (0, 2**31 - 1)),
-    **dict.fromkeys(["total_updates", "num_envs", "num_minibatches", "update_epochs"], (1, 10**6)),
+    **dict.fromkeys(["total_updates", "num_envs", "num_minibatches", "update_epochs", "radius_curriculum"], (1, 10**6)),
     **dict.fromkeys(["embed_dim", "num_heads", "mlp_dim", "hidden_dim"], (1, 8192)),
     **dict.fromkeys(["learning_rate", "learning_rate_final", "clip_coef", "weight_average"], (0.0, 1.0)),
     **dict.fromkeys(["gamma", "gae_lambda", "memory_noise"], (0.0, 1.0)),
     **dict.fromkeys(["ent_coef", "ent_coef_final", "vf_coef"], (0.0, 1e3)),
     **dict.fromkeys(["reward_scale", "max_grad_norm", "target_kl"], (1e-9, 1e9)),
-    **{"eval_starts": (10, 10**6), "num_blocks": (1, 64), "memory_length": (0, 8192)},
-    **{"radius_curriculum": (1.0, 1e3), "log_std": (-5.0, 0.5)},
+    **{"eval_starts": (10, 10**6), "num_blocks": (1, 64), "memory_length": (0, 8192), "log_std": (-5.0, 0.5)},
 }
 NETWORK = ["num_blocks", "embed_dim", "num_heads", "memory_length", "mlp_dim", "hidden_dim"]
 POLICY = {name: type(getattr(Args, name)) for name in ["env_id", "observe_phase", *NETWORK]}  # a checkpoint decides
@@ -420,8 +413,10 @@ def check_args(args, typed):
         refuse("env_id", args.env_id, f"must be one of {', '.join(ENV_IDS)}")
     if args.embed_dim % args.num_heads:
         refuse("num_heads", args.num_heads, f"must divide --embed-dim {args.embed_dim}")
-    if (args.eval_json or args.eval_npz) and not args.eval_only:
-        refuse("eval_json", args.eval_json or args.eval_npz, "only with --eval-only, as --eval-npz")
+    for name in ("eval_json", "eval_npz"):
+        path = getattr(args, name)
+        if path is not None and not (args.eval_only and Path(path).parent.is_dir()):
+            refuse(name, path, "must be in an existing folder, and goes with --eval-only")
     if args.track and importlib.util.find_spec("wandb") is None:
         refuse("track", "", "needs wandb: pip install wandb")
     if args.num_minibatches > args.num_envs:
@@ -441,13 +436,16 @@ def training_state(args, agent, average, optimizer, envs, progress):
 
 
 def restore(state, agent, average, optimizer, envs):
-    """Put everything back where `training_state` found it; returns the progress."""
-    for name, module in (("agent", agent), ("average", average), ("optimizer", optimizer)):
-        module.load_state_dict(state[name])
-    torch.set_rng_state(state["rng"]["torch"])
-    torch.cuda.set_rng_state_all(state["rng"]["cuda"][: torch.cuda.device_count()])
-    envs.np_random.bit_generator.state = json.loads(state["rng"]["envs"])
-    return state["progress"]
+    """Put everything back where `training_state` found it; returns the progress. One line if something does not fit."""
+    try:
+        for name, module in (("agent", agent), ("average", average), ("optimizer", optimizer)):
+            module.load_state_dict(state[name])
+        torch.set_rng_state(state["rng"]["torch"])
+        torch.cuda.set_rng_state_all(state["rng"]["cuda"][: torch.cuda.device_count()])
+        envs.np_random.bit_generator.state = json.loads(state["rng"]["envs"])
+        return {name: state["progress"][name] for name in ("seed", "total_updates", "global_step", "wall_seconds")}
+    except (KeyError, RuntimeError, TypeError, ValueError) as error:
+        fail(f"--resume: training_state.pt does not fit its own args ({error}); it must be whole")
 
 
 def load_state(run_dir):
@@ -466,14 +464,12 @@ def save_run(run_dir, state):
     with evaluate.replacing(run_dir / "training_state.pt") as file:
         torch.save(state, file)
     metadata = {"env_id": state["args"]["env_id"], "args": json.dumps(state["args"]), **state["progress"]}
-    weights = {name.removeprefix("module."): tensor.cpu() for name, tensor in state["average"].items()}
-    del weights["n_averaged"]
+    weights = {k.removeprefix("module."): v.cpu() for k, v in state["average"].items() if k != "n_averaged"}
     data = safetensors.torch.save(weights, {key: str(value) for key, value in metadata.items()})
     evaluate.write_bytes(run_dir / "agent.safetensors", data)
 
 
 # Shared: evaluation, training, main -----------------------------------------------------------------------------------
-
 SAVE_EVERY = 10  # updates
 TRAINING_EVAL_SEED = 2**31  # beyond --eval-seed: no reported start is flown during training
 
@@ -511,12 +507,8 @@ def log_update(writer, args, progress, batch, episodes, losses, learning_rate):
         print(f"update {iteration}/{total}, {progress['global_step']} steps, {clock}: {describe(episodes)}", flush=True)
 
 
-def train(args, agent, average, envs, writer, run_dir, saved):
+def train(args, agent, average, optimizer, envs, writer, run_dir, progress):
     """Algorithm 1; returns the training state after the last whole update, which Ctrl-C makes the last one."""
-    optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
-    progress = {"seed": args.seed, "total_updates": 0, "global_step": 0, "wall_seconds": 0.0}
-    if args.resume is not None:
-        progress = restore(saved, agent, average, optimizer, envs)
     state = training_state(args, agent, average, optimizer, envs, progress)
     try:
         for iteration in range(progress["total_updates"] + 1, args.total_updates + 1):
@@ -538,29 +530,37 @@ def train(args, agent, average, envs, writer, run_dir, saved):
                 metrics, _ = evaluate_agent(average.module, args, envs, TRAINING_EVAL_SEED, progress)
                 log_scalars(writer, "eval", metrics, progress["global_step"])
     except KeyboardInterrupt:
-        print("interrupted: saving the last whole update")
+        pass  # `state` is that of the last whole update
     except FloatingPointError as error:
-        fail(f"update {iteration}: {error}; it must be finite. The last good checkpoint is in {run_dir}")
+        if args.save_model:
+            save_run(run_dir, state)
+        kept = f"; the last good checkpoint is {run_dir}/training_state.pt" if args.save_model else ""
+        fail(f"update {iteration}: {error}, must be finite{kept}")
     return state
 
 
 def run(args, agent, envs, saved):
     """Train (or go on), save, evaluate, print the table."""
     run_dir = Path(args.resume or f"runs/{args.env_id}__{args.exp_name}__{args.seed}__{int(time.time())}")
+    average = AveragedModel(agent, multi_avg_fn=get_ema_multi_avg_fn(args.weight_average))
+    optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
+    progress = {"seed": args.seed, "total_updates": 0, "global_step": 0, "wall_seconds": 0.0}
+    if args.resume is not None:
+        progress = restore(saved, agent, average, optimizer, envs)
     if args.track:
         import wandb
-
         names = {"project": args.wandb_project_name, "entity": args.wandb_entity, "name": run_dir.name}
         wandb.init(**names, sync_tensorboard=True, config=asdict(args), save_code=True)
-    run_dir.mkdir(parents=True, exist_ok=True)
-    evaluate.write_json(run_dir / "args.json", asdict(args))
-    writer = SummaryWriter(run_dir, purge_step=1 + (saved["progress"]["global_step"] if args.resume else 0))
-    average = AveragedModel(agent, multi_avg_fn=get_ema_multi_avg_fn(args.weight_average))
-    state = train(args, agent, average, envs, writer, run_dir, saved)
+    run_dir.mkdir(parents=True, exist_ok=args.resume is not None)
+    evaluate.write_json(run_dir / "args.json", {**asdict(args), "resume": None})
+    writer = SummaryWriter(run_dir, purge_step=progress["global_step"] + 1)
+    state = train(args, agent, average, optimizer, envs, writer, run_dir, progress)
+    writer.flush()
     if args.save_model:
         save_run(run_dir, state)
     if (done := state["progress"]["total_updates"]) < args.total_updates:
-        print(f"stopped after update {done}; go on with: python {Path(__file__).name} --resume {run_dir}")
+        saved = f"go on with: python {Path(__file__).name} --resume {run_dir}" if args.save_model else "nothing saved"
+        print(f"stopped after update {done}; {saved}")
         sys.exit(130)
     metrics, arrays = evaluate_agent(average.module, args, envs, args.eval_seed, state["progress"])
     log_scalars(writer, "eval", metrics, metrics["global_step"])
@@ -580,7 +580,7 @@ def main(argv):
     envs = gym.make_vec(args.env_id, num_envs=args.num_envs, observe_phase=args.observe_phase)
     envs.reset(seed=args.seed)
     agent = Agent(args, envs).to("cuda" if torch.cuda.is_available() and args.cuda else "cpu")
-    if args.checkpoint is not None:
+    if args.checkpoint is not None and args.resume is None:
         try:
             agent.load_state_dict({name: torch.from_numpy(array) for name, array in saved["tensors"].items()})
         except RuntimeError as error:

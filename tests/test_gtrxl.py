@@ -79,8 +79,8 @@ def test_rollout_stores_what_training_recomputes(dtype, uneven_envs):
         torch.testing.assert_close(rolled[batch.alive > 0], trained[batch.alive > 0], rtol=0, atol=TOLERANCE[dtype])
     living = alive[:23]
     np.testing.assert_allclose(array(batch.obs)[:23][living], np.array(envs.given_obs)[:23][living], atol=1e-7)
-    np.testing.assert_array_equal(array(batch.actions)[:23][living], np.array(envs.taken_actions)[living])
-    rewards = np.array(envs.given_rewards) * living
+    np.testing.assert_array_equal(array(batch.actions)[:23][living], np.array(envs.taken_actions)[:23][living])
+    rewards = np.array(envs.given_rewards)[:23] * living
     np.testing.assert_allclose(array(batch.rewards)[:23], 0.1 * rewards, rtol=1e-6)
     np.testing.assert_allclose(finals["episodic_return"], rewards.sum(axis=0), rtol=1e-6)
 
