@@ -416,7 +416,7 @@ def check_args(args, typed):
     for name in ("eval_json", "eval_npz"):
         path = getattr(args, name)
         if path is not None and not (args.eval_only and Path(path).parent.is_dir()):
-            refuse(name, path, "must be in an existing folder, and goes with --eval-only")
+            refuse(name, path, "only with --eval-only, and must be in an existing folder")
     if args.track and importlib.util.find_spec("wandb") is None:
         refuse("track", "", "needs wandb: pip install wandb")
     if args.num_minibatches > args.num_envs:
@@ -435,7 +435,7 @@ def training_state(args, agent, average, optimizer, envs, progress):
     return copy.deepcopy({"args": {**asdict(args), "resume": None}, "progress": progress, "rng": rng, **modules})
 
 
-def restore(state, agent, average, optimizer, envs):
+def restore(state, run_dir, agent, average, optimizer, envs):
     """Put everything back where `training_state` found it; returns the progress. One line if something does not fit."""
     try:
         for name, module in (("agent", agent), ("average", average), ("optimizer", optimizer)):
@@ -445,7 +445,7 @@ def restore(state, agent, average, optimizer, envs):
         envs.np_random.bit_generator.state = json.loads(state["rng"]["envs"])
         return {name: state["progress"][name] for name in ("seed", "total_updates", "global_step", "wall_seconds")}
     except (KeyError, RuntimeError, TypeError, ValueError) as error:
-        fail(f"--resume: training_state.pt does not fit its own args ({error}); it must be whole")
+        fail(f"--resume {run_dir}: its training_state.pt does not fit its own args ({error}); it must be whole")
 
 
 def load_state(run_dir):
@@ -546,7 +546,7 @@ def run(args, agent, envs, saved):
     optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
     progress = {"seed": args.seed, "total_updates": 0, "global_step": 0, "wall_seconds": 0.0}
     if args.resume is not None:
-        progress = restore(saved, agent, average, optimizer, envs)
+        progress = restore(saved, run_dir, agent, average, optimizer, envs)
     if args.track:
         import wandb
         names = {"project": args.wandb_project_name, "entity": args.wandb_entity, "name": run_dir.name}
