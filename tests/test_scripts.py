@@ -189,7 +189,7 @@ def test_smoke_run_is_short(smoke):
     """15 s on a free core; CPU time is counted, with room for a core that is shared."""
     *_, env_id, _, seconds = smoke
     print(f"{env_id}: {seconds:.1f} s of CPU time")
-    assert seconds < 15
+    assert seconds < 22
 
 
 def test_smoke_run_writes_what_the_interface_names(smoke):
