@@ -3,6 +3,7 @@
 Importing this module registers (section "Numerical Simulations" of the paper)
 
     DoubleIntegrator-v0  DoubleIntegratorWaypoints-v0  VanDerPol-v0  VanDerPolWaypoints-v0
+    RocketAscent-v0  RocketAscentCutoff-v0
 
 `gymnasium.make(id)` gives one environment, `gymnasium.make_vec(id, num_envs=N)` N of them, stepped together in float64
 NumPy with no Python loop over environments. Reading order: problem tables, dynamics, environments, registration.
@@ -12,7 +13,8 @@ To add a problem of this kind: write its dynamics, its table, and one line in `P
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -315,17 +317,15 @@ class SingleEnv(gym.Env):
         return obs[0], float(rewards[0]), bool(terminated[0]), False, {key: value[0] for key, value in final.items()}
 
 
+def of_batch(name: str, doc: str) -> property:
+    """A property of a single environment that is its batch's."""
+    return property(lambda env: getattr(env.batch, name), lambda env, value: setattr(env.batch, name, value), doc=doc)
+
+
 class PhasedEnv(SingleEnv):
     """One `PhasedVectorEnv`."""
 
-    @property
-    def radius_scale(self):
-        """Factor on the radii in which the reward pays the bonus (1: the paper)."""
-        return self.batch.radius_scale
-
-    @radius_scale.setter
-    def radius_scale(self, value):
-        self.batch.radius_scale = value
+    radius_scale = of_batch("radius_scale", "Factor on the radii in which the reward pays the bonus (1: the paper).")
 
 
 def make_phased_vector(env_id: str, num_envs: int = 1, **options) -> PhasedVectorEnv:
@@ -358,6 +358,546 @@ def fly(env_id: str, policy: Callable, x0, **options) -> dict:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
+# Rocket ascent: vehicle, Earth and target (the paper's table "Vehicle Properties and Simulation Parameters")
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Engine:
+    """One row block of the table: a solid booster or a stage."""
+
+    total_mass: float  # kg
+    propellant: float  # kg
+    thrust: float  # N
+    isp: float  # s, as the table rounds it
+    burn_time: float  # s
+
+    def flow(self, table_isp: bool) -> float:
+        """Propellant flow in kg/s: propellant / burn time (the GPOPS-II benchmark's), or T / (g0 Isp) of the table."""
+        return self.thrust / (G0 * self.isp) if table_isp else self.propellant / self.burn_time
+
+
+@dataclass(frozen=True)
+class Burn:
+    """A phase: the engines that burn until `end` and those whose dry mass is dropped then, as (number, engine)."""
+
+    end: float  # s
+    engines: tuple[tuple[int, Engine], ...]
+    dropped: tuple[tuple[int, Engine], ...] = ()
+
+    @property
+    def thrust(self) -> float:
+        """N."""
+        return sum(n * engine.thrust for n, engine in self.engines)
+
+    def flow(self, table_isp: bool) -> float:
+        """kg/s."""
+        return sum(n * engine.flow(table_isp) for n, engine in self.engines)
+
+    @property
+    def jettison(self) -> float:
+        """kg; propellant that did not burn stays on board."""
+        return sum(n * (engine.total_mass - engine.propellant) for n, engine in self.dropped)
+
+
+class OrbitalElements(NamedTuple):
+    """Keplerian elements, each an array over the states."""
+
+    a: np.ndarray  # semi-major axis, m (negative on a hyperbola, infinite on a parabola)
+    e: np.ndarray  # eccentricity
+    i: np.ndarray  # inclination, rad, 0..pi
+    raan: np.ndarray  # right ascension of the ascending node, rad, 0..2 pi; 0 on an equatorial orbit
+    argp: np.ndarray  # argument of perigee, rad, 0..2 pi; 0 on a circular orbit
+
+
+G0 = 9.80665  # m/s^2
+BOOSTER = Engine(total_mass=19290.0, propellant=17010.0, thrust=628500.0, isp=284.0, burn_time=75.2)
+STAGE_1 = Engine(total_mass=104380.0, propellant=95550.0, thrust=1083100.0, isp=301.7, burn_time=261.0)
+STAGE_2 = Engine(total_mass=19300.0, propellant=16820.0, thrust=110094.0, isp=462.4, burn_time=700.0)
+
+
+@dataclass(frozen=True)
+class Rocket:
+    """Constants of the GPOPS-II benchmark. A vehicle of your own is `dataclasses.replace(ROCKET, ...)`."""
+
+    burns: tuple[Burn, ...] = (
+        Burn(75.2, ((6, BOOSTER), (1, STAGE_1)), dropped=((6, BOOSTER),)),
+        Burn(150.4, ((3, BOOSTER), (1, STAGE_1)), dropped=((3, BOOSTER),)),
+        Burn(261.0, ((1, STAGE_1),), dropped=((1, STAGE_1),)),
+        Burn(961.0, ((1, STAGE_2),)),
+    )
+    payload: float = 4164.0  # kg
+    mu: float = 3.986012e14  # m^3/s^2
+    Re: float = 6378145.0  # m
+    omega_e: float = 7.29211585e-5  # rad/s
+    rho0: float = 1.225  # kg/m^3
+    H: float = 7200.0  # m
+    Cd: float = 0.5
+    S: float = 4 * np.pi  # m^2
+    latitude: float = 28.5  # degrees, geocentric; the longitude is 0
+    a: float = 24361140.0  # m, target orbit
+    e: float = 0.7308
+    i: float = 28.5  # degrees
+    raan: float = 269.8  # degrees
+    argp: float = 130.5  # degrees
+    dt: float = 2.0  # s
+    end_time: float = 961.0  # s
+    table_isp: bool = False
+
+    @property
+    def x0(self) -> np.ndarray:
+        """The start (7,): r (m) and v (m/s), inertial and Earth-centred, at rest on the ground, and the mass (kg)."""
+        latitude = np.radians(self.latitude)
+        r = self.Re * np.array([np.cos(latitude), 0.0, np.sin(latitude)])
+        parts = {engine for burn in self.burns for _, engine in burn.engines}
+        number = {engine: max(sum(n for b in self.burns for n, e in b.dropped if e == engine), 1) for engine in parts}
+        mass = self.payload + sum(n * engine.total_mass for engine, n in number.items())
+        return np.array([*r, 0.0, self.omega_e * r[0], 0.0, mass])
+
+    @property
+    def target(self) -> OrbitalElements:
+        """The target orbit's elements in m and rad."""
+        return OrbitalElements(self.a, self.e, *np.radians([self.i, self.raan, self.argp]))
+
+    @property
+    def target_energy(self) -> float:
+        """Specific energy of the target orbit, -mu / (2 a), in J/kg."""
+        return -self.mu / (2 * self.a)
+
+    def arcs(self) -> list[tuple[float, float, float, float, float]]:
+        """What is constant between events: (start s, end s, thrust N, flow kg/s, kg dropped at the end), in order.
+
+        A last stage that runs dry before its phase ends gives an arc of its own without thrust.
+        """
+        arcs, start = [], 0.0
+        for burn in self.burns:
+            flow = burn.flow(self.table_isp)
+            dry = start + sum(n * engine.propellant for n, engine in burn.engines) / flow
+            if burn is self.burns[-1] and dry < burn.end - 1e-6:  # rounding alone is not an event
+                arcs.append((start, dry, burn.thrust, flow, 0.0))
+                start, flow = dry, 0.0
+            arcs.append((start, burn.end, burn.thrust if flow else 0.0, flow, burn.jettison))
+            start = burn.end
+        return arcs
+
+
+ROCKET = Rocket()
+
+
+def ascent(x, u, rocket: Rocket = ROCKET):
+    """r' = v, v' = -mu r / |r|^3 + T u / m + D / m, m' = -flow ("Multiphase Rocket Ascent Problem").
+
+    D = -1/2 rho Cd S |v_rel| v_rel, rho = rho0 exp(-h / H), v_rel = v - omega_e x r. x: r, v, m by components; u: the
+    unit thrust direction by components, thrust T (N) and propellant flow (kg/s).
+    """
+    rx, ry, rz, vx, vy, vz, m = x
+    ux, uy, uz, thrust, flow = u
+    r2 = rx * rx + ry * ry + rz * rz
+    r = r2**0.5
+    gravity, push = -rocket.mu / (r2 * r), thrust / m
+    wx, wy = vx + rocket.omega_e * ry, vy - rocket.omega_e * rx  # v_rel; its third component is vz
+    rho = rocket.rho0 * np.exp((rocket.Re - r) / rocket.H)
+    drag = (-0.5 * rocket.Cd * rocket.S) * rho * (wx * wx + wy * wy + vz * vz) ** 0.5 / m
+    ax = gravity * rx + push * ux + drag * wx
+    ay = gravity * ry + push * uy + drag * wy
+    az = gravity * rz + push * uz + drag * vz
+    return vx, vy, vz, ax, ay, az, -flow
+
+
+def orbit_vectors(x, mu: float = ROCKET.mu):
+    """Angular momentum h = r x v and eccentricity vector e = v x h / mu - r / |r|, each a tuple of components."""
+    rx, ry, rz, vx, vy, vz = x[:6]
+    hx, hy, hz = ry * vz - rz * vy, rz * vx - rx * vz, rx * vy - ry * vx
+    r = (rx * rx + ry * ry + rz * rz) ** 0.5
+    ex, ey, ez = (vy * hz - vz * hy) / mu - rx / r, (vz * hx - vx * hz) / mu - ry / r, (vx * hy - vy * hx) / mu - rz / r
+    return (hx, hy, hz), (ex, ey, ez)
+
+
+def specific_energy(x, mu: float = ROCKET.mu):
+    """|v|^2 / 2 - mu / |r|, in J/kg, of a state by components."""
+    rx, ry, rz, vx, vy, vz = x[:6]
+    return (vx * vx + vy * vy + vz * vz) / 2 - mu / (rx * rx + ry * ry + rz * rz) ** 0.5
+
+
+def orbital_elements(state, mu: float = ROCKET.mu) -> OrbitalElements:
+    """Keplerian elements of states (..., 6 or more: r in m, v in m/s), each (...,); e.g. Vallado, algorithm 9 (RV2COE).
+
+    Where an angle has no meaning it is 0: the node of an equatorial orbit (the perigee is then counted from the x axis,
+    in the direction of flight), the perigee of a circular one. |r| must be positive.
+    """
+    x = np.moveaxis(np.asarray(state, dtype=np.float64), -1, 0)
+    h, e = (np.array(vector) for vector in orbit_vectors(x, mu))
+    energy = specific_energy(x, mu)
+    a = np.divide(-mu, 2 * energy, out=np.full(energy.shape, np.inf), where=energy != 0)
+    equatorial, eccentricity = (h[0] == 0) & (h[1] == 0), np.sqrt((e * e).sum(axis=0))
+    node = np.where(equatorial, 1.0, -h[1]), np.where(equatorial, 0.0, h[0])  # z x h, of any length
+    i = np.arctan2(np.hypot(h[0], h[1]), h[2])
+    along = node[0] * e[0] + node[1] * e[1]
+    # e . (h x node), in units of |h|: the component of e a right angle ahead of the node
+    ahead = e[0] * -h[2] * node[1] + e[1] * h[2] * node[0] + e[2] * (h[0] * node[1] - h[1] * node[0])
+    argp = np.arctan2(ahead, along * np.sqrt((h * h).sum(axis=0)))
+    circular = eccentricity < 1e-14
+    raan, argp = np.arctan2(node[1], node[0]) % (2 * np.pi), np.where(circular, 0.0, argp % (2 * np.pi))
+    return OrbitalElements(a, eccentricity, i, raan, argp)
+
+
+def target_orbit(elements: OrbitalElements = ROCKET.target, mu: float = ROCKET.mu):
+    """Angular momentum (..., 3), m^2/s, and eccentricity vector (..., 3) of orbits given by their elements (m, rad)."""
+    a, e, i, raan, argp = (np.asarray(element, dtype=np.float64) for element in elements)
+    normal = np.stack([np.sin(raan) * np.sin(i), -np.cos(raan) * np.sin(i), np.cos(i)], axis=-1)
+    perigee = [
+        np.cos(raan) * np.cos(argp) - np.sin(raan) * np.sin(argp) * np.cos(i),
+        np.sin(raan) * np.cos(argp) + np.cos(raan) * np.sin(argp) * np.cos(i),
+        np.sin(argp) * np.sin(i),
+    ]
+    return np.sqrt(mu * a * (1 - e * e))[..., None] * normal, e[..., None] * np.stack(perigee, axis=-1)
+
+
+def target_axes(rocket: Rocket = ROCKET) -> np.ndarray:
+    """Rows: perigee direction, semi-latus direction, plane normal of the target orbit, (3, 3), unit vectors in ECI."""
+    h, e = target_orbit(rocket.target, rocket.mu)
+    normal, perigee = h / np.linalg.norm(h), e / np.linalg.norm(e)
+    return np.array([perigee, np.cross(normal, perigee), normal])
+
+
+def terminal_error(state, rocket: Rocket = ROCKET) -> np.ndarray:
+    """(h - h_T) / |h_T| and e - e_T in ECI, (..., 6), of states (..., 6 or more: r in m, v in m/s).
+
+    Smooth, without a singularity, and zero exactly where all five elements are the target's.
+    """
+    h, e = orbit_vectors(np.moveaxis(np.asarray(state, dtype=np.float64), -1, 0), rocket.mu)
+    h_target, e_target = target_orbit(rocket.target, rocket.mu)
+    return np.concatenate(
+        [(np.stack(h, axis=-1) - h_target) / np.linalg.norm(h_target), np.stack(e, axis=-1) - e_target], axis=-1
+    )
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Rocket ascent: the five parts of the reward (the paper names them and gives no formula; these are ours)
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def orbital_reward(distance, next_distance):
+    """R_orbital = 10 (L_t - L_{t+1}), L the sum of |component| of the terminal error in the target orbit's axes.
+
+    Over an episode it adds up to 10 (L_0 - L_T): it is the objective, not a policy-invariant shaping. A sum over
+    components, because a norm hides the small ones behind the largest.
+    """
+    return 10.0 * (distance - next_distance)
+
+
+def trajectory_reward(energy, next_energy, phase, weight):
+    """R_trajectory = w (E_{t+1} - E_t) / (1 MJ/kg) in the first three phases, E the specific energy; by default w = 0."""
+    return weight * (next_energy - energy) / 1e6 * (phase < 3)
+
+
+def guidance_reward(u, frame, pitch, weight):
+    """R_guidance = -w (1 - u . d), d the direction at the reference pitch above the horizon, along the target's plane.
+
+    u (3, N); frame (3, 3, N) its rows up, along-track, cross-track; pitch (N,) in rad, NaN where there is no guidance.
+    """
+    cosine = (u * (np.sin(pitch) * frame[0] + np.cos(pitch) * frame[1])).sum(axis=0)
+    return np.where(np.isnan(pitch), 0.0, -weight * (1 - cosine))
+
+
+def penalties(altitude, time, turn, burnt, mass_weight):
+    """R_penalties = -40 1[h < 0] - 0.024 o - 0.024 s - 0.001 |u_t - u_{t-1}| - w_m (kg burnt after 261 s) / 100 kg.
+
+    o = clip((h - 245 km) / 100 km, 0, 1), overshoot; s = clip((110 km - h) / 30 km, 0, 1) after 300 s, a dip into the
+    air at orbital speed. A crash must cost more than the worst miss. Altitude in m and time in s at the step's end.
+    """
+    overshoot = np.clip((altitude - 245e3) / 100e3, 0.0, 1.0)
+    sag = np.clip((110e3 - altitude) / 30e3, 0.0, 1.0) * (time > 300.0)
+    return -40.0 * (altitude < 0) - 0.024 * (overshoot + sag) - 0.001 * turn - mass_weight * burnt / 100.0
+
+
+def terminal_reward(distance):
+    """R_terminal = -2 ln(1 + L_T / 0.01) at the episode's end, L_T as in R_orbital: steep near the target."""
+    return -2.0 * np.log1p(distance / 0.01)
+
+
+def precision_points(error_norm):
+    """The paper's terminal points, 2000 1[d < 0.02] + 1600 e^(-d/0.01) + 1600 e^(-d/0.001): reported only."""
+    return 2000.0 * (error_norm < 0.02) + 1600.0 * (np.exp(-error_norm / 0.01) + np.exp(-error_norm / 0.001))
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Rocket ascent: environments
+# ---------------------------------------------------------------------------------------------------------------------
+
+ACTION_FRAMES = ("eci", "local")
+REFERENCE_PITCH = {  # degrees above the horizon over time (s), until the second boosters are dropped; our own guess
+    "none": None,
+    "linear": ((0.0, 150.4), (90.0, 40.0)),
+    "knots": ((0.0, 10.0, 40.0, 75.2, 150.4), (90.0, 88.0, 72.0, 55.0, 35.0)),
+}
+STIFF = 0.25  # drag's rate |D| / (m |v_rel|) times the step, from which a step is cut
+
+
+def local_frame(y, normal):
+    """Unit vectors up, along-track, cross-track of the plane with this normal (3,) at states y (7, N): (3, 3, N)."""
+    up = y[:3] / np.sqrt((y[:3] ** 2).sum(axis=0))
+    (rx, ry, rz), (nx, ny, nz) = up, normal
+    along = np.stack([ny * rz - nz * ry, nz * rx - nx * rz, nx * ry - ny * rx])
+    along /= np.sqrt((along * along).sum(axis=0))
+    ax, ay, az = along
+    return np.stack([up, along, np.stack([ry * az - rz * ay, rz * ax - rx * az, rx * ay - ry * ax])])
+
+
+class RocketVectorEnv(BatchedEnv):
+    """N launches into a transfer orbit in four phases, steered by the thrust direction; 2 s steps, exact events.
+
+    Observation: [r (3) m, v (3) m/s, m kg, t_norm, phi] in ECI, t_norm = 1 - t / 961 s, phi in {0, 1/3, 2/3, 1} the
+    phase at the step's start. Action: the thrust direction, any length but 0 (ValueError), normalised here; with
+    `action_frame="local"` by (up, along-track, cross-track of the target plane) at the step's start, then held in ECI.
+    A step is one RK4 step between events: staging, a stage that runs dry (`table_isp`), the end of the episode.
+
+    With `cutoff` the engine stops when, in the last phase, the specific energy reaches the target's: the root within
+    the step, to 1e-10, ends the episode. An altitude below 0 ends it too (crash), and so does `end_time`.
+
+    Reward: the sum of the five parts R_orbital, R_trajectory, R_guidance, R_penalties and R_terminal, each a function
+    above. `final_info`, (N,) each but `error` (N, 6), the terminal error in ECI: `error_norm`; `a_km e i_deg raan_deg argp_deg
+    final_mass_kg final_time_s max_altitude_km` (at the steps' ends); the parts' sums, `episodic_return`, the paper's
+    `points`, `crashed`.
+
+    Attributes that only training changes: `mass_weight`, `trajectory_weight`, `guidance_weight`, `guidance` (a key of
+    `REFERENCE_PITCH`) and `end_time` (s, at most the last phase's end), of which the next `reset` takes notice.
+    """
+
+    PARTS = ("R_orbital", "R_trajectory", "R_guidance", "R_penalties", "R_terminal")
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        cutoff: bool = False,
+        action_frame: str = "eci",
+        table_isp: bool = False,
+        observe_phase: bool = True,
+        rocket: Rocket = ROCKET,
+    ):
+        if action_frame not in ACTION_FRAMES:
+            raise ValueError(f"action_frame is {action_frame!r}; it must be one of {', '.join(ACTION_FRAMES)}")
+        self.rocket = replace(rocket, table_isp=table_isp)
+        self.cutoff, self.action_frame, self.observe_phase = cutoff, action_frame, observe_phase
+        self.mass_weight, self.trajectory_weight, self.guidance_weight, self.guidance = 0.0, 0.0, 0.1, "none"
+        x0 = self.rocket.x0
+        # |v| stays below the launcher's delta-v and 961 s of gravity, and |r| below what that speed reaches
+        high = np.array([*[4e7] * 3, *[3e4] * 3, x0[-1], 1.0, 1.0])
+        low = np.array([*-high[:6], 0.0, 0.0, 0.0])
+        spaces = Box(low, high, dtype=np.float64), Box(-1.0, 1.0, (3,), dtype=np.float64)
+        super().__init__(num_envs, 1, *spaces)
+        self.end_time = self.rocket.end_time  # sets episode_steps, too
+        self._axes = target_axes(self.rocket)
+        h, e = target_orbit(self.rocket.target, self.rocket.mu)
+        self._h_scale = np.linalg.norm(h)
+        self._target = np.concatenate([self._axes @ h / self._h_scale, self._axes @ e])[:, None]
+        self.y = np.repeat(x0[:, None], num_envs, axis=1)  # (7, N)
+        self.u = np.zeros((3, num_envs))  # the direction of the step before, in ECI
+        self._parts = np.zeros((len(self.PARTS), num_envs))
+        self._distance, self._energy, self.time, self._max_altitude = np.zeros((4, num_envs))
+        self._crashed = np.zeros(num_envs, dtype=bool)
+
+    @property
+    def end_time(self) -> float:
+        """Seconds after which an episode ends at the latest; the last step is shorter where 2 s do not divide it."""
+        return float(self._grid[-1])
+
+    @end_time.setter
+    def end_time(self, value: float):
+        if not 0 < value <= self.rocket.end_time:
+            raise ValueError(f"end_time is {value} s; it must be positive and at most {self.rocket.end_time}")
+        self.episode_steps = int(np.ceil(value / self.rocket.dt - 1e-9))
+        self._grid = np.append(self.rocket.dt * np.arange(self.episode_steps), float(value))
+        self._tabulate()
+
+    def _tabulate(self):
+        """The arcs by step. A step has up to two, `first` and `last`, with an event between them."""
+        arcs, begin, end = np.array(self.rocket.arcs()), self._grid[:-1], self._grid[1:]
+        first, last = (np.searchsorted(arcs[:, 1], time, side="right").clip(max=len(arcs) - 1) for time in (begin, end))
+        if (last - first).max() > 1:
+            raise ValueError(f"two events fall into one step of {self.rocket.dt} s")
+        self._event = first < last  # (steps,)
+        self._until_event = np.where(self._event, arcs[first, 1], end) - begin  # (steps,) s
+        self._thrust, self._flow = (arcs[np.stack([first, last]), column] for column in (2, 3))  # (2, steps)
+        self._dropped = arcs[first, 4] * self._event  # (steps,) kg
+        phase_ends = [burn.end for burn in self.rocket.burns[:-1]]
+        self._phase = np.searchsorted(phase_ends, self._grid, side="right")  # (steps + 1,), 0-based
+        phase = np.append(self._phase[:-1], self._phase[-2]) / len(phase_ends)  # the last entry is seen at the end
+        self._clock = np.column_stack([1 - self._grid / self.rocket.end_time, phase]) * self.observe_phase
+
+    def _start(self, mask, options):
+        if options:
+            raise ValueError(f"reset options are {options!r}; a rocket has one start and no options")
+        self.y[:, mask] = self.rocket.x0[:, None]
+        self._parts[:, mask] = self.u[:, mask] = 0.0
+        self._max_altitude[mask] = self.time[mask] = 0.0
+        distance, energy = self._progress()
+        self._distance[mask], self._energy[mask] = distance[mask], energy[mask]
+
+    def _progress(self):
+        """The distance L to the target orbit (see `orbital_reward`) and the specific energy, both (N,)."""
+        h, e = orbit_vectors(self.y, self.rocket.mu)
+        error = np.concatenate([self._axes @ h / self._h_scale, self._axes @ e]) - self._target
+        return np.abs(error).sum(axis=0), specific_energy(self.y, self.rocket.mu)
+
+    def _observe(self):
+        return np.column_stack([self.y.T, self._clock[self.t]])
+
+    def _directions(self, actions):
+        """Unit thrust directions in ECI (3, N) of actions (N, 3); ValueError names the first of length zero."""
+        largest = np.abs(actions).max(axis=1)
+        if not largest.all():
+            bad = int(np.argmin(largest))
+            raise ValueError(f"action of env {bad} at step {self.t[bad]} is [0, 0, 0]; a direction must have a length")
+        u = actions.T / largest  # before squaring: neither overflow nor underflow
+        u /= np.sqrt((u * u).sum(axis=0))
+        return (local_frame(self.y, self._axes[2]) * u[:, None]).sum(axis=0) if self.action_frame == "local" else u
+
+    def _advance(self, actions):
+        t, u, before = self.t, self._directions(actions), self.y
+        duration = self._grid[t + 1] - self._grid[t]
+        self.y = self._fly(before, u, t, duration)
+        done = t + 1 == self.episode_steps
+        if self.cutoff:
+            reached = (self._phase[t] == self._phase[-1]) & (
+                specific_energy(self.y, self.rocket.mu) >= self.rocket.target_energy
+            )
+            if reached.any():
+                self.y[:, reached], duration[reached] = self._cut(before, u, t, duration, reached)
+            done = done | reached
+        altitude = np.sqrt((self.y[:3] ** 2).sum(axis=0)) - self.rocket.Re
+        self._crashed = altitude < 0
+        done = done | self._crashed
+        self.time = self._grid[t] + duration
+        self._max_altitude = np.maximum(self._max_altitude, altitude)
+        rewards = self._reward(before, u, altitude, done)
+        self.u, self.t = u, t + 1
+        return rewards, done, self._final_info
+
+    def _fly(self, y, u, t, duration):
+        """States (7, n) after `duration` (n,) seconds of the steps t (n,) from y (7, n), u (3, n) held."""
+        first = np.minimum(duration, self._until_event[t])
+        y = self._arc(y, u, first, self._thrust[0, t], self._flow[0, t])
+        passed = np.flatnonzero(self._event[t] & (duration >= self._until_event[t]))
+        if len(passed):
+            y[6, passed] -= self._dropped[t[passed]]
+            rest, thrust, flow = duration[passed] - first[passed], self._thrust[1, t[passed]], self._flow[1, t[passed]]
+            y[:, passed] = self._arc(y[:, passed], u[:, passed], rest, thrust, flow)
+        return y
+
+    def _arc(self, y, u, dt, thrust, flow):
+        """States (7, n) after dt (n,) seconds without an event: one RK4 step, several for a plunge into dense air.
+
+        There drag is stiff: its rate times the step, at the lowest altitude that the step can reach, is kept below
+        `STIFF`. No ascent comes near it; without this a crash at orbital speed would end in numbers without meaning.
+        """
+        rocket, controls = self.rocket, (*u, thrust, flow)
+        f = lambda x, u: ascent(x, u, rocket)  # noqa: E731
+        speed = np.sqrt((y[3:6] ** 2).sum(axis=0))
+        lowest = np.maximum(np.sqrt((y[:3] ** 2).sum(axis=0)) - rocket.Re - speed * dt, 0.0)
+        rate = rocket.rho0 * np.exp(-lowest / rocket.H) * rocket.Cd * rocket.S * speed / y[6]
+        y_next = np.stack(rk4(f, y, controls, dt))
+        stiff = np.flatnonzero(rate * dt > STIFF)
+        if len(stiff):
+            n = int(np.ceil((rate * dt)[stiff].max() / STIFF))
+            y_sub, controls, dt = y[:, stiff], tuple(c[stiff] for c in controls), dt[stiff] / n
+            for _ in range(n):
+                aloft = (y_sub[:3] ** 2).sum(axis=0) >= rocket.Re**2  # who is below the ground stays there
+                y_sub = np.where(aloft, np.stack(rk4(f, y_sub, controls, dt)), y_sub)
+            y_next[:, stiff] = y_sub
+        return y_next
+
+    def _cut(self, before, u, t, duration, reached):
+        """States (7, n) and times (n,) within the step at which those who `reached` the target's energy have just it.
+
+        Regula falsi with the Illinois change (Dowell and Jarratt, 1971): the energy grows almost linearly in a step.
+        """
+        before, u, t, goal = before[:, reached], u[:, reached], t[reached], self.rocket.target_energy
+        low, high = np.zeros(len(t)), duration[reached]
+        excess = lambda y: specific_energy(y, self.rocket.mu) - goal  # noqa: E731
+        f_low, f_high = excess(before), excess(self.y[:, reached])
+        y, time = self.y[:, reached], high
+        for _ in range(50):
+            time = low - f_low * (high - low) / (f_high - f_low)
+            y = self._fly(before, u, t, time)
+            f = excess(y)
+            if (np.abs(f) <= 1e-11 * abs(goal)).all():
+                break
+            above = f >= 0
+            f_low, f_high = np.where(above, f_low / 2, f), np.where(above, f, f_high / 2)
+            low, high = np.where(above, low, time), np.where(above, time, high)
+        return y, time
+
+    def _reward(self, before, u, altitude, done):
+        """The five parts of this step, added to their sums; returns their total, (N,)."""
+        t, phase = self.t, self._phase[self.t]
+        distance, energy = self._progress()
+        turn = np.sqrt(((u - self.u) ** 2).sum(axis=0)) * (t > 0)
+        burnt = (before[6] - self.y[6]) * (phase == self._phase[-1])
+        parts = np.zeros_like(self._parts)
+        parts[0] = orbital_reward(self._distance, distance)
+        parts[1] = trajectory_reward(self._energy, energy, phase, self.trajectory_weight)
+        if REFERENCE_PITCH[self.guidance] is not None:
+            pitch = np.radians(np.interp(self._grid[t], *REFERENCE_PITCH[self.guidance], right=np.nan))
+            parts[2] = guidance_reward(u, local_frame(before, self._axes[2]), pitch, self.guidance_weight)
+        parts[3] = penalties(altitude, self.time, turn, burnt, self.mass_weight)
+        parts[4, done] = terminal_reward(distance[done])
+        self._parts += parts
+        self._distance, self._energy = distance, energy
+        return parts.sum(axis=0)
+
+    def _final_info(self):
+        y = self.y.T
+        error, elements = terminal_error(y, self.rocket), orbital_elements(y, self.rocket.mu)
+        error_norm = np.sqrt((error * error).sum(axis=1))
+        info = {"error": error, "error_norm": error_norm, "a_km": elements.a / 1e3, "e": elements.e}
+        info |= {f"{name}_deg": np.degrees(getattr(elements, name)) for name in ("i", "raan", "argp")}
+        info |= {"final_mass_kg": self.y[6].copy(), "final_time_s": self.time.copy(), "crashed": self._crashed.copy()}
+        info |= {"max_altitude_km": self._max_altitude / 1e3, "points": precision_points(error_norm)}
+        return info | dict(zip(self.PARTS, self._parts.copy())) | {"episodic_return": self._parts.sum(axis=0)}
+
+
+class RocketEnv(SingleEnv):
+    """One `RocketVectorEnv`; its public attributes are the batch's."""
+
+    mass_weight = of_batch("mass_weight", "Reward lost per 100 kg of propellant burnt in the last phase.")
+    trajectory_weight = of_batch("trajectory_weight", "Weight of R_trajectory.")
+    guidance_weight = of_batch("guidance_weight", "Weight of R_guidance.")
+    guidance = of_batch("guidance", "The reference pitch of R_guidance, a key of REFERENCE_PITCH.")
+    end_time = of_batch("end_time", "Seconds after which an episode ends at the latest.")
+
+
+def make_rocket_vector(num_envs: int = 1, **options) -> RocketVectorEnv:
+    """The batched rocket; what `gymnasium.make_vec` calls."""
+    return RocketVectorEnv(num_envs, **options)
+
+
+def make_rocket(**options) -> RocketEnv:
+    """The single rocket; what `gymnasium.make` calls."""
+    return RocketEnv(make_rocket_vector(**options))
+
+
+def fly_rocket(env_id: str, policy: Callable, end_time: float | None = None, **options) -> dict:
+    """Fly `policy(obs (1, obs), t) -> action (1, 3)` once, to `end_time` (s) at the latest, and record what happened.
+
+    Returns t (K+1,) s, u (K, 3) the unit directions in ECI, y (K+1, 7) r, v, m, reward (K,), and the last step's info.
+    """
+    env = gym.make_vec(env_id, num_envs=1, **options)
+    if end_time is not None:
+        env.end_time = end_time
+    obs, _ = env.reset()
+    t, u, y, rewards, final = [0.0], [], [obs[0, :7]], [], {}
+    while not final:
+        obs, reward, _, final = env.advance(policy(obs, len(u)))
+        t.append(env.time[0])
+        u.append(env.u[:, 0])
+        y.append(obs[0, :7])
+        rewards.append(reward[0])
+    final = {key: value[0] for key, value in final.items()}
+    return {"t": np.array(t), "u": np.array(u), "y": np.array(y), "reward": np.array(rewards), **final}
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 # Registration (no max_episode_steps: the horizon is the problem's own, and its end a true one)
 # ---------------------------------------------------------------------------------------------------------------------
 
@@ -367,4 +907,12 @@ for _env_id in PROBLEMS:
         entry_point=f"{__name__}:make_phased",
         vector_entry_point=f"{__name__}:make_phased_vector",
         kwargs={"env_id": _env_id},
+    )
+ROCKETS = {"RocketAscent-v0": {"cutoff": False}, "RocketAscentCutoff-v0": {"cutoff": True}}
+for _env_id, _options in ROCKETS.items():
+    gym.register(
+        id=_env_id,
+        entry_point=f"{__name__}:make_rocket",
+        vector_entry_point=f"{__name__}:make_rocket_vector",
+        kwargs=_options,
     )
