@@ -3,8 +3,9 @@
     python evaluate.py publish RUN_DIR results/di     # add a run to a results folder (--ship: make it the shipped one)
     python evaluate.py figures results/di             # redraw its figures and print its table (a run folder works too)
 
-Reading order: cases and ratios, table, files, training curves, figures, results folders, command line. The names of all
-metrics (`eval.json`) and arrays (`eval.npz`) are the project's interface. Costs are the paper's J: plain sums, no unit.
+Reading order: cases and ratios, table, files, training curves, figures, rocket ascent (its metrics, table and figures),
+results folders, command line. The names of all metrics (`eval.json`) and arrays (`eval.npz`) are the interface of the
+project. Costs are the paper's J: plain sums, no unit.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import json
 import math
 import sys
 import zipfile
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -44,7 +46,9 @@ def starts(seed: int, n: int) -> np.ndarray:
 
 @lru_cache(maxsize=4)  # evaluations during training fly the same starts again and again
 def optimum(env_id: str, eval_seed: int, n: int) -> dict:
-    """`baselines.reference` from the n starts of a seed."""
+    """`baselines.reference` from the n starts of a seed; of a rocket, which has one start, the flown optimum."""
+    if env_id in envs.ROCKETS:
+        return baselines.rocket_reference(env_id)
     return baselines.reference(env_id, starts(eval_seed, n))
 
 
@@ -53,8 +57,10 @@ def evaluate(env_id, policy, eval_seed: int, n: int, reference: dict | None = No
 
     `reference` is `optimum(env_id, eval_seed, n)`, solved here when it is not given; `env_options`
     go to the environment. Returns the `metrics` of eval.json that do not depend on the run, as plain numbers, and the
-    `arrays` of eval.npz. Raises ValueError if the reference belongs to other starts.
+    `arrays` of eval.npz. Raises ValueError if the reference belongs to other starts. A rocket has one start.
     """
+    if env_id in envs.ROCKETS:
+        return evaluate_rocket(env_id, policy, eval_seed, reference, **env_options)
     x0 = starts(eval_seed, n)
     flight = envs.fly(env_id, policy, x0, **env_options)
     reference = optimum(env_id, eval_seed, n) if reference is None else reference
@@ -146,6 +152,8 @@ def table(metrics: dict) -> str:
 
     The means are over all starts. Where some miss a circle, the ratio of J is over the others and its parts have none.
     """
+    if metrics["env_id"] in envs.ROCKETS:
+        return rocket_table(metrics)
     phases = envs.PROBLEMS[metrics["env_id"]].phases
     all_compared = len(phases) == 1 or metrics["hit_rate"] == metrics["reference_hit_rate"] == 1
     rows = [("", "optimum", "ours", "ratio")]
@@ -262,6 +270,8 @@ def read_evaluation(folder: Path) -> tuple[dict, dict]:
     except (ValueError, EOFError, zipfile.BadZipFile) as error:
         raise ValueError(f"{path} is not a readable .npz: {error}") from error
     needed = {"t", "x", "u", "reward", "cost", "x_reference", "u_reference", "cost_reference"}
+    if metrics["env_id"] in envs.ROCKETS:
+        needed = {f"{key}{side}" for key in ("t", "u", "y") for side in ("", "_reference")} | {"reward"}
     if missing := needed - arrays.keys():
         raise ValueError(f"{path} lacks {', '.join(sorted(missing))}")
     return metrics, arrays
@@ -273,8 +283,9 @@ def read_json(path: Path) -> dict:
         metrics = json.loads(path.read_text())
     except ValueError as error:
         raise ValueError(f"{path} is not readable JSON: {error}") from error
-    if not isinstance(metrics, dict) or metrics.get("env_id") not in envs.PROBLEMS:
-        raise ValueError(f"{path}: env_id must be one of {', '.join(envs.PROBLEMS)}")
+    known = [*envs.PROBLEMS, *envs.ROCKETS]
+    if not isinstance(metrics, dict) or metrics.get("env_id") not in known:
+        raise ValueError(f"{path}: env_id must be one of {', '.join(known)}")
     if not isinstance(metrics.get("seed"), int):
         raise ValueError(f"{path}: seed is {metrics.get('seed')!r}; it must be an integer")
     return metrics
@@ -339,10 +350,14 @@ BOUNDARY = {"color": "0.5", "linewidth": 0.8, "linestyle": ":"}
 def figures(folder, arrays: dict, metrics: dict, curve: dict | None = None, others=()) -> list[Path]:
     """Draw trajectories.png, costs.png and, given the run's training curve, training.png into `folder`.
 
-    `arrays` and `metrics` are those of `evaluate`; `others` are the training curves of other seeds. Returns the paths.
+    Of a rocket: trajectory.png and orbit.png instead of the first two. `arrays` and `metrics` are those of `evaluate`;
+    `others` are the training curves of other seeds. Returns the paths.
     """
     drawn = {} if curve is None else {"training.png": draw_training([curve, *others], metrics)}
-    drawn |= {"trajectories.png": draw_trajectories(arrays, metrics), "costs.png": draw_costs(arrays, metrics)}
+    if metrics["env_id"] in envs.ROCKETS:
+        drawn |= {"trajectory.png": draw_ascent(arrays, metrics), "orbit.png": draw_orbit(arrays, metrics)}
+    else:
+        drawn |= {"trajectories.png": draw_trajectories(arrays, metrics), "costs.png": draw_costs(arrays, metrics)}
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     for name, figure in drawn.items():
@@ -353,6 +368,8 @@ def figures(folder, arrays: dict, metrics: dict, curve: dict | None = None, othe
 
 def headline(metrics: dict) -> str:
     """A figure's title: the problem and how close to the optimum the policy flies."""
+    if metrics["env_id"] in envs.ROCKETS:
+        return rocket_headline(metrics)
     if "ratio_of_sums" not in metrics:
         return f"{metrics['env_id']}: no cost ratio, {metrics['hit_rate']:.1%} of the starts hit every circle"
     title = f"{metrics['env_id']}: cost {metrics['ratio_of_sums']:.4f} x optimum"
@@ -363,12 +380,14 @@ def headline(metrics: dict) -> str:
 
 def draw_training(curves: list[dict], metrics: dict) -> Figure:
     """Reward, policy loss and total loss over the samples; with several seeds each thin and their median thick."""
-    figure = Figure(figsize=(12, 3.8), layout="constrained")
-    seeds = f", {len(curves)} seeds" if len(curves) > 1 else ""
-    figure.suptitle(f"{headline(metrics)}{seeds}")
     panels = {"charts/episodic_return": "episodic return", "losses/policy_loss": "policy loss"}
     panels["losses/total_loss"] = "total loss"
-    for ax, (tag, label) in zip(figure.subplots(1, 3), panels.items()):
+    if any("eval/error_norm" in curve for curve in curves):
+        panels["eval/error_norm"] = "$\\Vert$error$\\Vert$ of the mean action"
+    figure = Figure(figsize=(4 * len(panels), 3.8), layout="constrained")
+    seeds = f", {len(curves)} seeds" if len(curves) > 1 else ""
+    figure.suptitle(f"{headline(metrics)}{seeds}")
+    for ax, (tag, label) in zip(figure.subplots(1, len(panels)), panels.items()):
         logged = [curve[tag] for curve in curves if tag in curve]
         if len(logged) > 1:
             for k, (steps, values) in enumerate(logged):
@@ -383,6 +402,8 @@ def draw_training(curves: list[dict], metrics: dict) -> Figure:
         ax.xaxis.set_major_formatter(EngFormatter(sep=""))
         ax.set(xlabel="environment steps", ylabel=label)
         ax.grid(alpha=0.3)
+        if metrics["env_id"] in envs.ROCKETS and logged:
+            scale_rocket_panel(ax, tag, np.concatenate([values for _, values in logged]))
     return figure
 
 
@@ -490,6 +511,296 @@ def draw_bars(ax, ours: np.ndarray, optimum: np.ndarray, label: str):
 
 
 # ---------------------------------------------------------------------------------------------------------------------
+# Rocket ascent: metrics and table. One start and a deterministic policy, so that one flight says everything
+# ---------------------------------------------------------------------------------------------------------------------
+
+SUCCESS = 0.02  # the error's norm below which the paper pays its bonus
+ELEMENT_ERRORS = {"a_km": "a_error_km", "e": "e_error", "i_deg": "i_error_deg"}
+ELEMENT_ERRORS |= {"raan_deg": "raan_error_deg", "argp_deg": "argp_error_deg"}
+ROCKET_ROWS = (  # of the table: label, metric, digits
+    ("semi-major axis a (km)", "a_km", 3),
+    ("eccentricity e", "e", 6),
+    ("inclination i (deg)", "i_deg", 4),
+    ("right ascension of the node (deg)", "raan_deg", 4),
+    ("argument of perigee (deg)", "argp_deg", 4),
+    ("perigee altitude (km)", "perigee_km", 3),
+    ("apogee altitude (km)", "apogee_km", 3),
+    ("final mass (kg)", "final_mass_kg", 3),
+    ("  of the optimum's", "mass_ratio", 6),
+    ("final time (s)", "final_time_s", 3),
+    ("maximum altitude (km)", "max_altitude_km", 3),
+    ("lowest altitude after 300 s (km)", "min_altitude_after_300s_km", 3),
+    (f"||error|| (success: below {SUCCESS})", "error_norm", 6),
+)
+
+
+def evaluate_rocket(env_id, policy, eval_seed: int, reference: dict | None = None, **env_options):
+    """`evaluate` for a rocket: `policy(obs (1, 9), t) -> action (1, 3)` flown once beside the optimum's flight.
+
+    `eval_seed` is only noted. Metrics that are not finite (the apogee of a hyperbola) are left out.
+    """
+    flight = envs.fly_rocket(env_id, policy, **env_options)
+    reference = optimum(env_id, 0, 1) if reference is None else reference
+    metrics = {"env_id": env_id, "eval_seed": eval_seed, "eval_starts": 1} | rocket_metrics(flight, reference)
+    arrays = {key: flight[key] for key in ("t", "u", "y", "reward")}
+    return metrics, arrays | {f"{key}_reference": reference[key] for key in ("t", "u", "y")}
+
+
+def rocket_metrics(flight: dict, reference: dict) -> dict:
+    """The metrics of a flight of `envs.fly_rocket` beside the optimum's, `baselines.rocket_reference`."""
+    metrics, best, target = flight_summary(flight), flight_summary(reference), target_summary()
+    for key, error in ELEMENT_ERRORS.items():
+        metrics[error] = wrapped(key, metrics[key] - target[key])
+    metrics |= {f"reference_{key}": value for key, value in best.items() if not key.startswith("final_")}
+    metrics |= {key: reference[key] for key in ("reference_mass_kg", "reference_time_s", "nine_pitch_error_norm")}
+    metrics["mass_ratio"] = metrics["final_mass_kg"] / metrics["reference_mass_kg"]
+    metrics |= {key: flight[key] for key in (*envs.RocketVectorEnv.PARTS, "points")}
+    metrics = {key: float(value) for key, value in metrics.items() if np.isfinite(value)}
+    return metrics | {"success": bool(flight["error_norm"] < SUCCESS), "crashed": bool(flight["crashed"])}
+
+
+def flight_summary(flight: dict) -> dict:
+    """What is said of ours and of the optimum alike: elements, altitudes (km above Re), mass, time, return."""
+    keys = ("error_norm", *ELEMENT_ERRORS, "final_mass_kg", "final_time_s", "max_altitude_km", "episodic_return")
+    summary = {key: flight[key] for key in keys} | apsides(flight["a_km"], flight["e"])
+    late = altitude_km(flight["y"])[flight["t"] > 300.0]
+    return summary | {"min_altitude_after_300s_km": late.min(initial=np.inf)}
+
+
+def apsides(a_km: float, e: float) -> dict:
+    """Altitudes of perigee and apogee above Re in km; a hyperbola (a < 0) has its apogee at infinity."""
+    Re = envs.ROCKET.Re / 1e3
+    return {"perigee_km": a_km * (1 - e) - Re, "apogee_km": a_km * (1 + e) - Re if a_km > 0 else np.inf}
+
+
+def altitude_km(y: np.ndarray) -> np.ndarray:
+    """Altitudes (K+1,) in km of states y (K+1, 7)."""
+    return (np.linalg.norm(y[:, :3], axis=1) - envs.ROCKET.Re) / 1e3
+
+
+def target_summary() -> dict:
+    """The target orbit in the metrics' names and units."""
+    rocket = envs.ROCKET
+    elements = {"a_km": rocket.a / 1e3, "e": rocket.e, "i_deg": rocket.i}
+    return elements | {"raan_deg": rocket.raan, "argp_deg": rocket.argp} | apsides(rocket.a / 1e3, rocket.e)
+
+
+def wrapped(key: str, difference: float) -> float:
+    """A difference of the metric `key`; of angles in degrees the short way round, -180 to 180."""
+    return (difference + 180.0) % 360.0 - 180.0 if key.endswith("_deg") else difference
+
+
+def rocket_table(metrics: dict) -> str:
+    """The table "target | optimum | ours | difference" of a rocket's evaluation; "-" where there is no number."""
+    target = target_summary()
+    best = {key: metrics.get(f"reference_{key}") for _, key, _ in ROCKET_ROWS} | {"mass_ratio": 1.0}
+    best |= {"final_mass_kg": metrics["reference_mass_kg"], "final_time_s": metrics["reference_time_s"]}
+    rows = [("", "target", "optimum", "ours", "difference")]
+    for label, key, digits in ROCKET_ROWS:
+        ours, compared = metrics.get(key), target.get(key, best[key])
+        cells = ["-" if v is None else f"{v:.{digits}f}" for v in (target.get(key), best[key], ours)]
+        missing = ours is None or compared is None
+        rows.append((label, *cells, "-" if missing else f"{wrapped(key, ours - compared):+.{digits}f}"))
+    success = ["yes" if hit else "no" for hit in (best["error_norm"] < SUCCESS, metrics["success"])]
+    rows.append(("success", "-", *success, "crashed" if metrics["crashed"] else "-"))
+    width = max(len(row[0]) for row in rows)
+    parts = ", ".join(f"{part} {metrics[part]:.3f}" for part in envs.RocketVectorEnv.PARTS)
+    returns = f"return {metrics['episodic_return']:.3f} (the optimum's {metrics['reference_episodic_return']:.3f})"
+    return "\n".join(
+        [
+            f"{metrics['env_id']}: difference from the target, or where there is none from the optimum",
+            *(f"  {row[0]:<{width}}" + "".join(f" {cell:>11}" for cell in row[1:]) for row in rows),
+            f"  {returns}; the paper's points: {metrics['points']:.1f}",
+            f"    of it: {parts}",
+            "  Opponent, open loop: the optimum's pitch at nine times, interpolated: "
+            f"||error|| {metrics['nine_pitch_error_norm']:.6f}",
+        ]
+    )
+
+
+def rocket_headline(metrics: dict) -> str:
+    """A figure's title: error and mass."""
+    crash = ", crashed" if metrics["crashed"] else ""
+    mass = f"final mass {metrics['final_mass_kg']:.1f} kg, optimum {metrics['reference_mass_kg']:.1f} kg"
+    return f"{metrics['env_id']}: ||error|| {metrics['error_norm']:.5f}, {mass}{crash}"
+
+
+def rocket_seed_lines(runs: list[dict]) -> list[str]:
+    """`seed_lines` of two or more rocket runs: error and mass of each, and medians and ranges."""
+    lines = []
+    for run in runs:
+        mass = f"final mass {run['final_mass_kg']:.2f} kg ({run['mass_ratio']:.4f} of the optimum's)"
+        lines.append(f"  seed {run['seed']}: ||error|| {run['error_norm']:.6f}, {mass}")
+    errors, masses = ([run[key] for run in runs] for key in ("error_norm", "final_mass_kg"))
+    spread = f"median ||error|| {np.median(errors):.6f}, {min(errors):.6f} to {max(errors):.6f}"
+    mass = f"median final mass {np.median(masses):.2f} kg, {min(masses):.2f} to {max(masses):.2f}"
+    return [*lines, f"  {len(runs)} seeds: {spread}; {mass}"]
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Rocket ascent: figures
+# ---------------------------------------------------------------------------------------------------------------------
+
+ALTITUDE_LIMIT = 250.0  # km, the paper's
+DASHED = {"linewidth": 1.4, "linestyle": (0, (6, 5))}  # one line a panel: gaps that show the other line beneath
+OURS, BEST = {**POLICY, "linewidth": 2.2}, {**OPTIMUM, **DASHED}
+# velocities share a panel with positions: the same widths and dashes, paler
+VELOCITY = {**OURS, "color": "lightcoral"}, {**BEST, "color": "deepskyblue", "alpha": 0.6}
+FLIGHTS = {"": OURS, "_reference": BEST}  # by the suffix of their arrays
+
+
+def scale_rocket_panel(ax, tag: str, values: np.ndarray):
+    """The y axis of a training panel: the error in log scale; a loss without the few updates that would dominate it."""
+    if tag == "eval/error_norm":
+        ax.set_yscale("log")
+        line = ax.axhline(SUCCESS, **{**TARGET, "linestyle": "--"}, label=f"success: below {SUCCESS}")
+        ax.legend(handles=[line], loc="upper right")
+    elif tag.startswith("losses/"):
+        low, high = np.percentile(values, [5, 95])
+        span = high - low
+        inside = values[(values >= low - span) & (values <= high + span)]
+        if len(inside) < len(values):
+            margin = 0.05 * np.ptp(inside)
+            ax.set_ylim(inside.min() - margin, inside.max() + margin)
+            ax.set_title(f"cut; all values: {values.min():.3g} to {values.max():.3g}", fontsize=9)
+
+
+def draw_ascent(arrays: dict, metrics: dict) -> Figure:
+    """The paper's six panels (mass, altitude, speed, components), the thrust direction below them, pitch and yaw."""
+    figure = Figure(figsize=(15, 13), layout="constrained")
+    rows = [["mass", "altitude", "speed"], ["x", "y", "z"], ["ux", "uy", "uz"]]
+    mosaic = [[name for name in row for _ in range(2)] for row in rows] + [["pitch"] * 3 + ["yaw"] * 3]
+    panels = figure.subplot_mosaic(mosaic, height_ratios=[3, 3, 1.3, 2])
+    velocity = [panels[axis].twinx() for axis in "xyz"]
+    for (side, style), pale in zip(FLIGHTS.items(), VELOCITY):
+        t, u, y = (arrays[f"{key}{side}"] for key in ("t", "u", "y"))
+        panels["mass"].plot(t, y[:, 6] / 1e3, **style)
+        panels["altitude"].plot(t, altitude_km(y), **style)
+        panels["speed"].plot(t, np.linalg.norm(y[:, 3:6], axis=1) / 1e3, **style)
+        for k, axis in enumerate("xyz"):
+            panels[axis].plot(t, y[:, k] / 1e3, **style)
+            velocity[k].plot(t, y[:, 3 + k] / 1e3, **pale)
+            panels[f"u{axis}"].stairs(u[:, k], t, baseline=None, **{**style, "linewidth": style["linewidth"] / 1.5})
+        for name, angle in zip(("pitch", "yaw"), pitch_and_yaw(u, y)):
+            panels[name].stairs(angle, t, baseline=None, **style)
+    panels["altitude"].axhline(ALTITUDE_LIMIT, **{**TARGET, "linestyle": "--"})
+    label_ascent(panels, velocity)
+    figure.suptitle(rocket_headline(metrics))
+    lines = [(OURS, "policy"), (BEST, "optimum"), (VELOCITY[0], "velocity, policy")]
+    lines += [(VELOCITY[1], "velocity, optimum"), ({**TARGET, "linestyle": "--"}, f"{ALTITUDE_LIMIT:.0f} km")]
+    lines += [(BOUNDARY, "end of a phase")]
+    handles = [Line2D([], [], **style, label=label) for style, label in lines]
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
+    return figure
+
+
+def label_ascent(panels: dict, velocity: list):
+    """Axes' labels, the phases' ends, and what is dropped at each of them."""
+    labels = {"mass": "(a) mass (t)", "altitude": "(b) altitude (km)", "speed": "(c) inertial speed (km/s)"}
+    labels |= {axis: f"({letter}) position ${axis}$ (km)" for letter, axis in zip("def", "xyz")}
+    labels |= {f"u{axis}": f"thrust $u_{axis}$" for axis in "xyz"}
+    labels |= {"pitch": "pitch above the horizon (deg)", "yaw": "yaw from the target plane (deg)"}
+    for name, ax in panels.items():
+        ax.set(xlabel="time (s)", ylabel=labels[name], ylim=(-1.1, 1.1) if name[0] == "u" else None)
+        ax.grid(alpha=0.3)
+        for burn in envs.ROCKET.burns[:-1]:
+            ax.axvline(burn.end, **BOUNDARY)
+    low, high = panels["yaw"].get_ylim()
+    panels["yaw"].set_ylim(min(low, -5), max(high, 5))  # a flight in the plane would show rounding errors only
+    for axis, ax in zip("xyz", velocity):
+        ax.set_ylabel(f"velocity $v_{axis}$ (km/s), pale", color="0.4")
+        ax.tick_params(axis="y", colors="0.4")
+    for burn, height in zip(envs.ROCKET.burns, (0.9, 0.75, 0.6)):  # of the axes; the last burn drops nothing
+        text = f" {burn.end} s: {burn.jettison / 1e3:.2f} t dropped"
+        panels["mass"].text(burn.end, height, text, transform=panels["mass"].get_xaxis_transform(), fontsize=9)
+
+
+def pitch_and_yaw(u: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pitch above the local horizon and yaw from the target plane, (K,) each in degrees, of u (K, 3) at y (K+1, 7).
+
+    Yaw is NaN within six degrees of the vertical: its direction there is noise.
+    """
+    up, along, cross = np.einsum("cdk,kd->ck", envs.local_frame(y[: len(u)].T, envs.target_axes()[2]), u)
+    yaw = np.where(np.hypot(along, cross) > 0.1, np.degrees(np.arctan2(cross, along)), np.nan)
+    return np.degrees(np.arcsin(np.clip(up, -1, 1))), yaw
+
+
+def orbit_points(rocket: envs.Rocket) -> np.ndarray:
+    """Points (n, 3) in km, ECI, of the orbit with this rocket's target elements; NaN where a hyperbola has none."""
+    anomaly = np.radians(np.linspace(-180, 180, 3601))
+    slowness = 1 + rocket.e * np.cos(anomaly)
+    r = rocket.a / 1e3 * (1 - rocket.e**2) / np.where(slowness > 1e-3, slowness, np.nan)
+    perigee, semi_latus, _ = envs.target_axes(rocket)
+    return r[:, None] * (np.cos(anomaly)[:, None] * perigee + np.sin(anomaly)[:, None] * semi_latus)
+
+
+def draw_orbit(arrays: dict, metrics: dict) -> Figure:
+    """Ascent, target orbit and the orbit reached in the target's plane; the insertion enlarged; the ground track."""
+    figure = Figure(figsize=(13, 11), layout="constrained")
+    panels = figure.subplot_mosaic([["plane", "insertion"], ["ground", "ground"]], height_ratios=[3, 2])
+    reached = {key: metrics[f"{key}_deg"] for key in ("i", "raan", "argp")}
+    reached = replace(envs.ROCKET, a=1e3 * metrics["a_km"], e=metrics["e"], **reached)
+    lines = {
+        "target orbit": (orbit_points(envs.ROCKET), {**TARGET, "linewidth": 4.0, "alpha": 0.4}),
+        "policy": (arrays["y"][:, :3] / 1e3, OURS),
+        "orbit reached": (orbit_points(reached), {**OURS, "linewidth": 1.0, "linestyle": ":"}),
+        "optimum": (arrays["y_reference"][:, :3] / 1e3, BEST),
+    }
+    draw_target_plane(panels["plane"], panels["insertion"], lines)
+    top = 1.15 * max(ALTITUDE_LIMIT, metrics["max_altitude_km"], metrics["reference_max_altitude_km"])
+    panels["insertion"].set(ylim=(-0.03 * top, top))
+    draw_ground_track(panels["ground"], arrays)
+    for ax in figure.axes:
+        ax.grid(alpha=0.3)
+    figure.suptitle(rocket_headline(metrics))
+    figure.legend(*panels["plane"].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+    return figure
+
+
+def draw_target_plane(plane, insertion, lines: dict):
+    """The target's plane, perigee to the right, to scale; and in it altitude over angle, from launch to insertion.
+
+    `lines`: label -> (points (n, 3) in km, ECI; style). The second panel cuts the first along the horizon.
+    """
+    axes, Re, ends = envs.target_axes(), envs.ROCKET.Re / 1e3, []
+    for label, (r, style) in lines.items():
+        x, y, _ = axes @ r.T
+        angle, altitude = np.degrees(np.arctan2(y, x)), np.linalg.norm(r, axis=1) - Re
+        plane.plot(x / 1e3, y / 1e3, label=label, **style)
+        insertion.plot(angle, altitude, **style)
+        if label in ("policy", "optimum"):
+            insertion.plot(angle[-1], altitude[-1], "o", color=style["color"], fillstyle="none")
+            ends += [angle[0], angle[-1]]
+    plane.add_patch(Circle((0, 0), Re / 1e3, color="0.85", zorder=0))
+    plane.text(0, 0, "Earth", ha="center", va="center")
+    apogee = envs.ROCKET.a / 1e6 * (1 + envs.ROCKET.e)
+    plane.set(xlim=(-1.06 * apogee, 0.25 * apogee), ylim=(-0.65 * apogee, 0.65 * apogee), aspect="equal")
+    plane.set(xlabel="towards the target's perigee (1000 km)", ylabel="along its semi-latus rectum (1000 km)")
+    plane.set_title("Plane of the target orbit")
+    insertion.set(xlabel="angle from the target's perigee (deg)", ylabel="altitude (km)")
+    insertion.set(xlim=(min(ends) - 2, max(ends) + 8), title="Ascent and insertion (circles)")
+
+
+def draw_ground_track(ax, arrays: dict):
+    """Longitude (the launch site's is 0) and geocentric latitude of both flights, over the turning Earth."""
+    rocket = envs.ROCKET
+    along = np.radians(np.linspace(-90, 90, 361))[:, None]  # either side of the perigee
+    perigee, semi_latus, _ = envs.target_axes()
+    circle = np.cos(along) * perigee + np.sin(along) * semi_latus
+    tracks = [(circle, 0.0, {**TARGET, "alpha": 0.4}, "target plane at launch")]
+    tracks += [(circle, arrays["t"][-1], {**TARGET, "alpha": 0.4, "linestyle": ":"}, "target plane at the end")]
+    tracks += [(arrays[f"y{side}"], arrays[f"t{side}"], style, "") for side, style in FLIGHTS.items()]
+    for r, t, style, label in tracks:
+        longitude = np.degrees(np.unwrap(np.arctan2(r[:, 1], r[:, 0])) - rocket.omega_e * t)
+        ax.plot(longitude, np.degrees(np.arctan2(r[:, 2], np.hypot(r[:, 0], r[:, 1]))), label=label or None, **style)
+    flown = np.concatenate([line.get_xydata() for line in ax.lines[2:]])
+    (west, south), (east, north) = flown.min(axis=0), flown.max(axis=0)
+    ax.set(xlim=(west - 2, east + 2), ylim=(south - 2, north + 2), title="Ground track")
+    ax.set(xlabel="longitude from the launch site (deg)", ylabel="geocentric latitude (deg)")
+    ax.legend(loc="lower left")
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 # Results folders
 # ---------------------------------------------------------------------------------------------------------------------
 
@@ -536,6 +847,8 @@ def seed_lines(folder) -> list[str]:
     runs = sorted((read_json(path) for path in (Path(folder) / "seeds").glob("*.json")), key=lambda run: run["seed"])
     if len(runs) < 2:
         return []
+    if runs[0]["env_id"] in envs.ROCKETS:
+        return rocket_seed_lines(runs)
     lines = []
     for run in runs:
         ratio = f"{run['ratio_of_sums']:.4f}" if "ratio_of_sums" in run else "none"

@@ -85,15 +85,28 @@ class Args:
     ent_coef_final: float = 1e-4  # coefficient of the entropy in the last update (linear in between)
     vf_coef: float = 0.2  # coefficient of the value function
     max_grad_norm: float = 0.5  # the maximum norm for the gradient clipping
-    target_kl: float | None = None  # the target KL divergence threshold that ends an update's epochs
+    target_kl: float | None = None  # KL divergence from which an update takes no further step
+    target_kl_final: float | None = None  # the same in the last update (linear in between; none: --target-kl)
+    lr_schedule: str = "linear"  # linear, or kl: the learning rate follows half of --target-kl between its two ends
+    return_norm: str = "none"  # none, or time: the critic learns returns normalised over the episodes, step by step
+    noise: str = "learned"  # who sets the log-std: learned, schedule (linear), gated (falls when the episodes succeed)
     log_std: float = -0.5  # initial log of the policy's standard deviation, in the action's unit
+    log_std_final: float = -4.0  # with schedule the last update's, with gated the floor
+    noise_decay: float = 0.985  # gated: factor on the standard deviation after an update whose episodes succeed
     weight_average: float = 0.998  # decay of the averaged weights used in evaluation (0: off)
 
 
 # Problem: what differs from the other scripts -------------------------------------------------------------------------
 
 ENV_IDS = ("VanDerPol-v0", "VanDerPolWaypoints-v0")
-OBSERVATION_SCALE = dict(zip(ENV_IDS, ([1.0] * 3, [1.0] * 6)))  # physical scales: all entries are of order one
+ENV_OPTIONS = ("observe_phase",)  # arguments of the environments
+BUFFERS = {env_id: {"observation_scale": [1.0] * n} for env_id, n in zip(ENV_IDS, (3, 6))}  # all is of order one
+INITIAL_ACTION = [0.0]
+
+
+def features(obs, observation_scale):
+    """What the encoder sees of observations (..., obs)."""
+    return obs / observation_scale
 
 
 def set_curriculum(envs, args, progress):
@@ -102,10 +115,16 @@ def set_curriculum(envs, args, progress):
         envs.radius_scale = args.radius_curriculum ** max(0.0, 1 - progress / 0.6)
 
 
-def describe(episodes):
-    """What a progress line says of the sampled episodes (`final_info` arrays)."""
+def succeeded(episodes):
+    """Whether --noise gated lowers the noise: 85 % of the sampled episodes hit every circle."""
+    return episodes["hit"].all(axis=1).mean() >= 0.85
+
+
+def describe(episodes, metrics):
+    """What a progress line says of the sampled episodes (`final_info` arrays) and of the last evaluation, if any."""
     hit = " ".join(f"{share:4.0%}" for share in episodes["hit"].mean(axis=0))
-    return f"return {episodes['episodic_return'].mean():8.2f}  cost {episodes['cost'].mean():7.3f}  hits {hit}"
+    ratio = f"  ratio {metrics['ratio_of_sums']:.4f}" if "ratio_of_sums" in metrics else ""
+    return f"return {episodes['episodic_return'].mean():8.2f}  cost {episodes['cost'].mean():7.3f}  hits {hit}{ratio}"
 
 
 # Shared: Gated Transformer-XL ("Gated Transformer-XL Implementation") -------------------------------------------------
@@ -178,7 +197,7 @@ class RelativeAttention(nn.Module):
         q = self.query(x).view(heads) / math.sqrt(self.dk)  # (N, H, 1, dk)
         cache[:, :, :, t + L : t + L + 1] = torch.stack([self.key(x).view(heads), self.value(x).view(heads)])
         k, v = cache[:, :, :, t : t + L + 1]  # (N, H, L + 1, dk)
-        scores = q @ k.transpose(-1, -2) + q @ self.R.flip(1).transpose(-1, -2)  # (N, H, 1, L + 1)
+        scores = q @ (k + self.R.flip(1)).transpose(-1, -2)  # (N, H, 1, L + 1)
         return self.out((scores.softmax(dim=-1) @ v).flatten(1))
 
 
@@ -206,14 +225,22 @@ class Agent(nn.Module):
         super().__init__()
         d, hidden, actions = args.embed_dim, args.hidden_dim, envs.single_action_space.shape[0]
         self.num_blocks, self.memory_length, self.embed_dim = args.num_blocks, args.memory_length, d
-        self.register_buffer("observation_scale", torch.tensor(OBSERVATION_SCALE[args.env_id]))
+        self.constants = list(BUFFERS[args.env_id])
+        for name, value in BUFFERS[args.env_id].items():
+            self.register_buffer(name, torch.tensor(value))
         self.register_buffer("action_scale", torch.tensor(envs.single_action_space.high, dtype=torch.float32))
-        self.encoder = nn.Sequential(linear(len(self.observation_scale), d, gain=2**0.5), nn.GELU())
+        inputs = len(self.features(torch.ones(envs.single_observation_space.shape)))
+        self.encoder = nn.Sequential(linear(inputs, d, gain=2**0.5), nn.GELU())
         sizes = d, args.num_heads, args.memory_length, args.mlp_dim
         self.blocks = nn.ModuleList(GTrXLBlock(*sizes) for _ in range(args.num_blocks))
         self.actor = nn.Sequential(linear(d, hidden, gain=2**0.5), nn.GELU(), linear(hidden, actions, gain=0.01))
+        self.actor[-1].bias.data = torch.tensor(INITIAL_ACTION)
         self.critic = nn.Sequential(linear(d, hidden, gain=2**0.5), nn.GELU(), linear(hidden, 1))
-        self.actor_logstd = nn.Parameter(torch.full((actions,), args.log_std))
+        self.actor_logstd = nn.Parameter(torch.full((actions,), args.log_std), requires_grad=args.noise == "learned")
+
+    def features(self, obs):
+        """The problem's `features`, with its constants out of the checkpoint."""
+        return features(obs, *(getattr(self, name) for name in self.constants))
 
     def new_memory(self, num_envs, noise):
         """m_0 ~ N(0, noise^2), drawn once per episode and block: (blocks, N, L, d)."""
@@ -222,7 +249,7 @@ class Agent(nn.Module):
 
     def encode(self, obs, memory):
         """Whole episodes in parallel (training): obs (N, T, obs), memory (blocks, N, L, d) -> hidden (N, T, d)."""
-        x = self.encoder(obs / self.observation_scale)
+        x = self.encoder(self.features(obs))
         for block, block_memory in zip(self.blocks, memory):
             x = block(x, block.attention(x, block_memory))
         return x
@@ -234,7 +261,7 @@ class Agent(nn.Module):
 
     def encode_step(self, obs, cache, t):
         """Step t of the same episodes (rollout): obs (N, obs) -> hidden (N, d); its cost does not grow with t."""
-        x = self.encoder(obs / self.observation_scale)
+        x = self.encoder(self.features(obs))
         for block, block_cache in zip(self.blocks, cache):
             x = block(x, block.attention.step(x, block_cache, t))
         return x
@@ -244,7 +271,7 @@ class Agent(nn.Module):
         return self.actor(hidden) * self.action_scale
 
     def get_action_and_value(self, hidden, action=None):
-        """Sample (or take) the action: its value, log-probability, the policy's entropy and V, each without d."""
+        """Sample (or take) the action: its value, log-probability, the policy's entropy and the critic's output."""
         logstd = self.actor_logstd.clamp(-5.0, 0.5)
         mean = self.get_mean_action(hidden)
         probs = Normal(mean, logstd.exp().expand_as(mean), validate_args=False)
@@ -261,11 +288,34 @@ class Batch:
     actions: torch.Tensor  # (T, N, actions)
     logprobs: torch.Tensor  # (T, N)
     rewards: torch.Tensor  # (T, N), scaled
-    values: torch.Tensor  # (T, N)
+    values: torch.Tensor  # (T, N), the critic's output
     alive: torch.Tensor  # (T, N)
     memory: torch.Tensor  # (blocks, N, L, d)
     advantages: torch.Tensor | None = None  # (T, N), filled by update, as the returns
-    returns: torch.Tensor | None = None  # (T, N)
+    returns: torch.Tensor | None = None  # (T, N), the critic's target
+
+
+class ReturnNorm(nn.Module):
+    """V(s, t) = mean_t + std_t critic(s): the mean and spread over episodes of the return from each step on.
+
+    All episodes share the clock, and what differs between them is small beside what the steps to go bring.
+    """
+
+    def __init__(self, steps):
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(steps, 1))
+        self.register_buffer("std", torch.ones(steps, 1))
+        self.register_buffer("spread", torch.zeros(steps, 1))  # before the floor that `std` has
+
+    def observe(self, returns, alive):
+        """Move towards the statistics of the returns (T, N) of one update's episodes; a step no one lived to stays."""
+        count = alive.sum(dim=1, keepdim=True)
+        mean = (returns * alive).sum(dim=1, keepdim=True) / count.clamp(min=1)
+        spread = (((returns - mean) ** 2 * alive).sum(dim=1, keepdim=True) / count.clamp(min=1)).sqrt()
+        weight = (1 - 0.7 * (self.spread > 0).to(mean)) * (count > 0)  # the first update's statistics count in full
+        self.mean.lerp_(mean, weight)
+        self.spread.lerp_(spread, weight)
+        self.std.copy_((self.spread**2 + (0.3 * self.spread.mean()) ** 2 + 1e-8).sqrt())
 
 
 @torch.no_grad()
@@ -276,6 +326,7 @@ def rollout(agent, envs, reward_scale, memory_noise):
     batch = Batch(*(like.new_zeros(T, N, *shape) for shape in shapes), agent.new_memory(N, memory_noise))
     cache = agent.start_cache(batch.memory, T)
     alive, episodes, (next_obs, _) = np.ones(N, dtype=bool), {}, envs.reset()
+    batch.obs[:] = torch.as_tensor(next_obs)  # steps that nobody lives to are computed, too: they need a real state
     for t in range(T):
         batch.obs[t], batch.alive[t] = torch.as_tensor(next_obs), torch.as_tensor(alive)
         hidden = agent.encode_step(batch.obs[t], cache, t)
@@ -286,6 +337,8 @@ def rollout(agent, envs, reward_scale, memory_noise):
         for key, value in info.get("final_info", {}).items():
             episodes.setdefault(key, value.copy())[ended] = value[ended]
         alive = alive & ~terminated  # an ended environment has started anew; only its first episode counts
+        if not alive.any():
+            break
     return batch, episodes
 
 
@@ -320,32 +373,42 @@ def ppo_loss(agent, batch, mb, args, ent_coef):
     return loss, {name: value.detach() for name, value in losses.items()}
 
 
-def update(agent, average, optimizer, batch, args, ent_coef):
+def prepare(batch, norm, args):
+    """Fill in advantages and the critic's targets (Algorithm 1, lines 12-13); returns the explained variance."""
+    monte_carlo, _ = gae(batch.rewards, torch.zeros_like(batch.values), batch.alive, args.gamma, 1.0)
+    if args.return_norm == "time":
+        norm.observe(monte_carlo, batch.alive)
+    values, valid = norm.mean + norm.std * batch.values, batch.alive.bool()
+    batch.advantages, returns = gae(batch.rewards, values, batch.alive, args.gamma, args.gae_lambda)
+    batch.returns = ((monte_carlo if args.return_norm == "time" else returns) - norm.mean) / norm.std
+    if args.norm_adv:
+        adv = batch.advantages[valid]
+        batch.advantages = (batch.advantages - adv.mean()) / (adv.std() + 1e-8)
+    return 1 - (returns - values)[valid].var() / returns[valid].var()
+
+
+def update(agent, average, optimizer, norm, batch, args, ent_coef, target_kl):
     """K epochs of minibatches of whole episodes (Algorithm 1, lines 14-19); returns the mean of each logged loss.
 
     Raises FloatingPointError, before the optimiser moves the weights, when a loss or the gradient is not finite.
     """
-    batch.advantages, batch.returns = gae(batch.rewards, batch.values, batch.alive, args.gamma, args.gae_lambda)
-    valid, log = batch.alive.bool(), []
-    explained_variance = 1 - (batch.returns - batch.values)[valid].var() / batch.returns[valid].var()
-    if args.norm_adv:
-        adv = batch.advantages[valid]
-        batch.advantages = (batch.advantages - adv.mean()) / (adv.std() + 1e-8)
-    for epoch in range(args.update_epochs):
-        order = torch.randperm(batch.alive.shape[1], device=batch.alive.device)
-        for minibatch, mb in enumerate(order.tensor_split(args.num_minibatches)):
-            loss, losses = ppo_loss(agent, batch, mb, args, ent_coef)
-            optimizer.zero_grad()
-            loss.backward()
-            norm = nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
-            for name, value in {**losses, "gradient norm": norm}.items():
-                if not value.isfinite():
-                    raise FloatingPointError(f"{name} is {value} in epoch {epoch + 1}, minibatch {minibatch + 1}")
-            optimizer.step()
-            average.update_parameters(agent)
-            log.append(losses)
-        if args.target_kl is not None and losses["approx_kl"] > args.target_kl:
+    explained_variance, log, N = prepare(batch, norm, args), [], batch.alive.shape[1]
+    orders = [torch.randperm(N, device=batch.alive.device) for _ in range(args.update_epochs)]
+    minibatches = [(k + 1, mb) for order in orders for k, mb in enumerate(order.tensor_split(args.num_minibatches))]
+    for minibatch, mb in minibatches:
+        loss, losses = ppo_loss(agent, batch, mb, args, ent_coef)
+        log.append(losses)
+        if target_kl is not None and losses["approx_kl"] > target_kl:
             break
+        optimizer.zero_grad()
+        loss.backward()
+        gradient = nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
+        for name, value in {**losses, "gradient norm": gradient}.items():
+            if not value.isfinite():
+                epoch = (len(log) - 1) // args.num_minibatches + 1
+                raise FloatingPointError(f"{name} is {value} in epoch {epoch}, minibatch {minibatch}")
+        optimizer.step()
+        average.update_parameters(agent)
     means = {name: torch.stack([losses[name] for losses in log]).mean() for name in losses}
     return {name: value.item() for name, value in {**means, "explained_variance": explained_variance}.items()}
 
@@ -355,6 +418,27 @@ def linear_schedule(first, last, iteration, total):
     return first + (last - first) * (iteration - 1) / max(total - 1, 1)
 
 
+def begin_update(args, agent, optimizer, envs, span):
+    """Set what follows a schedule; returns this update's entropy coefficient and KL limit. span: iteration, total."""
+    if args.lr_schedule == "linear":
+        optimizer.param_groups[0]["lr"] = linear_schedule(args.learning_rate, args.learning_rate_final, *span)
+    if args.noise == "schedule":
+        agent.actor_logstd.fill_(linear_schedule(args.log_std, args.log_std_final, *span))
+    set_curriculum(envs, args, linear_schedule(0.0, 1.0, *span))
+    target_kl = args.target_kl and linear_schedule(args.target_kl, args.target_kl_final or args.target_kl, *span)
+    return linear_schedule(args.ent_coef, args.ent_coef_final, *span), target_kl
+
+
+def end_update(args, agent, optimizer, episodes, approx_kl, target_kl):
+    """Set what follows this update: the learning rate its KL (kl), the noise its episodes (gated)."""
+    group = optimizer.param_groups[0]
+    if args.lr_schedule == "kl":
+        factor = 1 / 1.3 if approx_kl > 0.75 * target_kl else 1.2 if approx_kl < target_kl / 3 else 1.0
+        group["lr"] = min(max(group["lr"] * factor, args.learning_rate_final), args.learning_rate)
+    if args.noise == "gated" and succeeded(episodes):
+        agent.actor_logstd.add_(math.log(args.noise_decay)).clamp_(min=args.log_std_final)
+
+
 # Shared: arguments ----------------------------------------------------------------------------------------------------
 RANGES = {  # lowest and highest value of every numeric flag; NaN and infinity are outside
     **dict.fromkeys(["seed", "eval_seed", "num_threads", "eval_every"], (0, 2**31 - 1)),
@@ -362,12 +446,15 @@ RANGES = {  # lowest and highest value of every numeric flag; NaN and infinity a
     **dict.fromkeys(["embed_dim", "num_heads", "mlp_dim", "hidden_dim"], (1, 8192)),
     **dict.fromkeys(["learning_rate", "learning_rate_final", "clip_coef", "weight_average"], (0.0, 1.0)),
     **dict.fromkeys(["gamma", "gae_lambda", "memory_noise"], (0.0, 1.0)),
-    **dict.fromkeys(["ent_coef", "ent_coef_final", "vf_coef"], (0.0, 1e3)),
-    **dict.fromkeys(["reward_scale", "max_grad_norm", "target_kl"], (1e-9, 1e9)),
-    **{"eval_starts": (10, 10**6), "num_blocks": (1, 64), "memory_length": (0, 8192), "log_std": (-5.0, 0.5)},
+    **dict.fromkeys(["ent_coef", "ent_coef_final", "vf_coef", "mass_weight"], (0.0, 1e3)),
+    **dict.fromkeys(["reward_scale", "max_grad_norm", "target_kl", "target_kl_final"], (1e-9, 1e9)),
+    **dict.fromkeys(["log_std", "log_std_final"], (-5.0, 0.5)),
+    **{"eval_starts": (10, 10**6), "num_blocks": (1, 64), "memory_length": (0, 8192), "noise_decay": (0.1, 1.0)},
 }
+CHOICES = {"env_id": ENV_IDS, "action_frame": ("local", "eci"), "guidance": ("none", "linear", "knots")}
+CHOICES |= {"lr_schedule": ("linear", "kl"), "return_norm": ("none", "time"), "noise": ("learned", "schedule", "gated")}
 NETWORK = ["num_blocks", "embed_dim", "num_heads", "memory_length", "mlp_dim", "hidden_dim"]
-POLICY = {name: type(getattr(Args, name)) for name in ["env_id", "observe_phase", *NETWORK]}  # a checkpoint decides
+POLICY = {name: type(getattr(Args, name)) for name in ["env_id", *ENV_OPTIONS, *NETWORK]}  # a checkpoint decides
 
 
 def fail(message):
@@ -393,9 +480,12 @@ def parse_args(argv):
         saved = evaluate.read_checkpoint(args.checkpoint, POLICY)
         for name in POLICY:
             value, given = saved["args"][name], getattr(args, name)
-            if name in typed and value != given:
+            if name == "env_id" and name in typed and value != given and BUFFERS.get(value) == BUFFERS.get(given):
+                print(f"--checkpoint is of {value}; it goes on with {given}")
+            elif name in typed and value != given:
                 refuse(name, given, f"the checkpoint has {value}; leave the flag out")
-            setattr(args, name, value)
+            else:
+                setattr(args, name, value)
     elif args.eval_only:
         refuse("checkpoint", None, "must name the agent.safetensors that --eval-only flies")
     check_args(args, typed)
@@ -405,12 +495,13 @@ def parse_args(argv):
 
 def check_args(args, typed):
     """Refuse what no run can use: SystemExit with one line that names the flag, the value and what is allowed."""
-    for name, (low, high) in RANGES.items():
-        value = getattr(args, name)
-        if value is not None and not low <= value <= high:
-            refuse(name, value, f"must be between {low} and {high}")
-    if args.env_id not in ENV_IDS:
-        refuse("env_id", args.env_id, f"must be one of {', '.join(ENV_IDS)}")
+    for name, value in vars(args).items():
+        if name in RANGES and value is not None and not RANGES[name][0] <= value <= RANGES[name][1]:
+            refuse(name, value, f"must be between {RANGES[name][0]} and {RANGES[name][1]}")
+        if name in CHOICES and value not in CHOICES[name]:
+            refuse(name, value, f"must be one of {', '.join(CHOICES[name])}")
+    if args.lr_schedule == "kl" and args.target_kl is None:
+        refuse("lr_schedule", args.lr_schedule, "needs --target-kl")
     if args.embed_dim % args.num_heads:
         refuse("num_heads", args.num_heads, f"must divide --embed-dim {args.embed_dim}")
     for name in ("eval_json", "eval_npz"):
@@ -427,18 +518,18 @@ def check_args(args, typed):
 
 
 # Shared: checkpoints --------------------------------------------------------------------------------------------------
-def training_state(args, agent, average, optimizer, envs, progress):
+def training_state(args, modules, envs, progress):
     """All that a bit-exact resume needs, copied, so that training can go on while it is kept."""
-    modules = {"agent": agent.state_dict(), "average": average.state_dict(), "optimizer": optimizer.state_dict()}
+    modules = {name: module.state_dict() for name, module in modules.items()}
     rng = {"torch": torch.get_rng_state(), "envs": json.dumps(envs.np_random.bit_generator.state)}
     rng["cuda"] = torch.cuda.get_rng_state_all()
     return copy.deepcopy({"args": {**asdict(args), "resume": None}, "progress": progress, "rng": rng, **modules})
 
 
-def restore(state, run_dir, agent, average, optimizer, envs):
+def restore(state, run_dir, modules, envs):
     """Put everything back where `training_state` found it; returns the progress. One line if something does not fit."""
     try:
-        for name, module in (("agent", agent), ("average", average), ("optimizer", optimizer)):
+        for name, module in modules.items():
             module.load_state_dict(state[name])
         torch.set_rng_state(state["rng"]["torch"])
         torch.cuda.set_rng_state_all(state["rng"]["cuda"][: torch.cuda.device_count()])
@@ -476,15 +567,17 @@ TRAINING_EVAL_SEED = 2**31  # beyond --eval-seed: no reported start is flown dur
 
 def evaluate_agent(agent, args, envs, eval_seed, progress):
     """Fly the mean action, from noise-free memory, and the optimum: eval.json's metrics and eval.npz's arrays."""
-    like, n = agent.actor_logstd, args.eval_starts
-    cache = agent.start_cache(agent.new_memory(n, noise=0.0), envs.episode_steps)
+    like, cache = agent.actor_logstd, []
 
     @torch.no_grad()
     def policy(obs, t):
+        if t == 0:
+            cache[:] = agent.start_cache(agent.new_memory(len(obs), noise=0.0), envs.episode_steps)
         hidden = agent.encode_step(torch.as_tensor(obs, dtype=like.dtype, device=like.device), cache, t)
         return agent.get_mean_action(hidden).cpu().numpy()
 
-    metrics, arrays = evaluate.evaluate(args.env_id, policy, eval_seed, n, observe_phase=args.observe_phase)
+    options = {name: getattr(args, name) for name in ENV_OPTIONS}
+    metrics, arrays = evaluate.evaluate(args.env_id, policy, eval_seed, args.eval_starts, **options)
     return {**metrics, **progress, "device": like.device.type, "torch_version": torch.__version__}, arrays
 
 
@@ -495,40 +588,41 @@ def log_scalars(writer, prefix, values, global_step):
             writer.add_scalar(f"{prefix}/{name}", value, global_step)
 
 
-def log_update(writer, args, progress, batch, episodes, losses, learning_rate):
-    """CleanRL's tags for one update and, a hundred times a run, a line that a person can follow."""
+def log_update(writer, args, progress, batch, episodes, losses, learning_rate, metrics):
+    """CleanRL's tags for one update and, with each evaluation or a hundred times a run, a line to follow it by."""
     iteration, total, seconds = progress["total_updates"], args.total_updates, progress["wall_seconds"]
     charts = {"episodic_return": episodes["episodic_return"].mean().item(), "learning_rate": learning_rate}
     charts |= {"episodic_length": batch.alive.sum(dim=0).mean().item(), "SPS": int(progress["global_step"] / seconds)}
     log_scalars(writer, "charts", charts, progress["global_step"])
     log_scalars(writer, "losses", losses, progress["global_step"])
-    if iteration % max(1, total // 100) == 0 or iteration == 1:
+    if iteration % (args.eval_every or max(1, total // 100)) == 0 or iteration == 1:
         clock = f"{seconds / 60:.1f} min gone, {(total - iteration) * seconds / iteration / 60:.1f} to go"
-        print(f"update {iteration}/{total}, {progress['global_step']} steps, {clock}: {describe(episodes)}", flush=True)
+        steps = f"{progress['global_step']} steps"
+        print(f"update {iteration}/{total}, {steps}, {clock}: {describe(episodes, metrics)}", flush=True)
 
 
-def train(args, agent, average, optimizer, envs, writer, run_dir, progress):
+def train(args, modules, envs, writer, run_dir, progress):
     """Algorithm 1; returns the training state after the last whole update, which Ctrl-C makes the last one."""
-    state = training_state(args, agent, average, optimizer, envs, progress)
+    agent, average, optimizer, norm = modules.values()
+    state, metrics = training_state(args, modules, envs, progress), {}
     try:
         for iteration in range(progress["total_updates"] + 1, args.total_updates + 1):
-            start, span = time.time(), (iteration, args.total_updates)
-            learning_rate = linear_schedule(args.learning_rate, args.learning_rate_final, *span)
-            optimizer.param_groups[0]["lr"] = learning_rate
-            ent_coef = linear_schedule(args.ent_coef, args.ent_coef_final, *span)
-            set_curriculum(envs, args, linear_schedule(0.0, 1.0, *span))
+            start = time.time()
+            ent_coef, target_kl = begin_update(args, agent, optimizer, envs, (iteration, args.total_updates))
+            learning_rate = optimizer.param_groups[0]["lr"]
             batch, episodes = rollout(agent, envs, args.reward_scale, args.memory_noise)
-            losses = update(agent, average, optimizer, batch, args, ent_coef)
+            losses = update(agent, average, optimizer, norm, batch, args, ent_coef, target_kl)
+            end_update(args, agent, optimizer, episodes, losses["approx_kl"], target_kl)
             progress = {**progress, "total_updates": iteration}
             progress["global_step"] += int(batch.alive.sum())
             progress["wall_seconds"] += time.time() - start
-            state = training_state(args, agent, average, optimizer, envs, progress)
-            log_update(writer, args, progress, batch, episodes, losses, learning_rate)
+            state = training_state(args, modules, envs, progress)
             if args.save_model and iteration % SAVE_EVERY == 0:
                 save_run(run_dir, state)
             if args.eval_every and iteration % args.eval_every == 0:
                 metrics, _ = evaluate_agent(average.module, args, envs, TRAINING_EVAL_SEED, progress)
                 log_scalars(writer, "eval", metrics, progress["global_step"])
+            log_update(writer, args, progress, batch, episodes, losses, learning_rate, metrics)
     except KeyboardInterrupt:
         pass  # `state` is that of the last whole update
     except FloatingPointError as error:
@@ -544,9 +638,11 @@ def run(args, agent, envs, saved):
     run_dir = Path(args.resume or f"runs/{args.env_id}__{args.exp_name}__{args.seed}__{int(time.time())}")
     average = AveragedModel(agent, multi_avg_fn=get_ema_multi_avg_fn(args.weight_average))
     optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
+    norm = ReturnNorm(envs.episode_steps).to(agent.actor_logstd.device)
+    modules = {"agent": agent, "average": average, "optimizer": optimizer, "norm": norm}
     progress = {"seed": args.seed, "total_updates": 0, "global_step": 0, "wall_seconds": 0.0}
     if args.resume is not None:
-        progress = restore(saved, run_dir, agent, average, optimizer, envs)
+        progress = restore(saved, run_dir, modules, envs)
     if args.track:
         import wandb
         names = {"project": args.wandb_project_name, "entity": args.wandb_entity, "name": run_dir.name}
@@ -554,7 +650,7 @@ def run(args, agent, envs, saved):
     run_dir.mkdir(parents=True, exist_ok=args.resume is not None)
     evaluate.write_json(run_dir / "args.json", {**asdict(args), "resume": None})
     writer = SummaryWriter(run_dir, purge_step=progress["global_step"] + 1)
-    state = train(args, agent, average, optimizer, envs, writer, run_dir, progress)
+    state = train(args, modules, envs, writer, run_dir, progress)
     writer.flush()
     if args.save_model:
         save_run(run_dir, state)
@@ -577,7 +673,8 @@ def main(argv):
     torch.set_num_threads(args.num_threads or torch.get_num_threads())
     torch.manual_seed(args.seed)
     torch.backends.cudnn.deterministic = args.torch_deterministic
-    envs = gym.make_vec(args.env_id, num_envs=args.num_envs, observe_phase=args.observe_phase)
+    options = {name: getattr(args, name) for name in ENV_OPTIONS}
+    envs = gym.make_vec(args.env_id, num_envs=args.num_envs, **options)
     envs.reset(seed=args.seed)
     agent = Agent(args, envs).to("cuda" if torch.cuda.is_available() and args.cuda else "cpu")
     if args.checkpoint is not None and args.resume is None:

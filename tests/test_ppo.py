@@ -49,13 +49,15 @@ class Learner:
         self.agent = make_agent(self.args, envs)
         self.average = AveragedModel(self.agent, multi_avg_fn=get_ema_multi_avg_fn(0.9))
         self.optimizer = RecordingAdam(self.agent)
+        self.norm = script.ReturnNorm(envs.episode_steps).double()
         self.collect()
 
     def collect(self):
         self.batch, self.finals = script.rollout(self.agent, self.envs, 1.0, 0.1)
 
     def update(self):
-        return script.update(self.agent, self.average, self.optimizer, self.batch, self.args, 1e-3)
+        modules = self.agent, self.average, self.optimizer, self.norm
+        return script.update(*modules, self.batch, self.args, 1e-3, self.args.target_kl)
 
 
 @pytest.fixture
@@ -118,6 +120,102 @@ def test_radius_curriculum(iteration, scale):
     envs = gym.make_vec("DoubleIntegratorWaypoints-v0", num_envs=1)
     script.set_curriculum(envs, script.Args(), script.linear_schedule(0.0, 1.0, iteration, 101))
     assert envs.radius_scale == pytest.approx(scale)
+
+
+def schedules(iteration, **changes):
+    """`begin_update` of update `iteration` of 11: what it returns, the learning rate and log-std that it set."""
+    args = make_args(learning_rate=1e-3, learning_rate_final=1e-4, ent_coef=0.5, ent_coef_final=0.1, **changes)
+    envs = gym.make_vec(args.env_id, num_envs=1)
+    agent = make_agent(args, envs)
+    optimizer = RecordingAdam(agent, lr=7.0)
+    returned = script.begin_update(args, agent, optimizer, envs, (iteration, 11))
+    return *returned, optimizer.param_groups[0]["lr"], agent.actor_logstd.item()
+
+
+def test_schedules_half_way():
+    """Update 6 of 11 is half-way; the log-std is linear, so the standard deviation falls geometrically."""
+    assert schedules(6) == pytest.approx((0.3, None, 5.5e-4, -0.5))
+    limits = {"target_kl": 0.03, "target_kl_final": 0.01}
+    assert schedules(6, noise="schedule", log_std_final=-3.5, **limits) == pytest.approx((0.3, 0.02, 5.5e-4, -2.0))
+    assert schedules(6, noise="gated", lr_schedule="kl", target_kl=0.03) == pytest.approx((0.3, 0.03, 7.0, -0.5))
+
+
+@pytest.mark.parametrize("kl, rate", [(0.005, 6e-4), (0.012, 5e-4), (0.03, 5e-4 / 1.3), (0.0, 6e-4)])
+def test_learning_rate_follows_the_kl(uneven_envs, kl, rate):
+    """Towards half of the limit 0.02: unchanged within a factor of 1.5 of it, and never beyond its two ends."""
+    args = make_args(lr_schedule="kl", learning_rate=1e-3, learning_rate_final=1e-5, target_kl=0.02)
+    optimizer = RecordingAdam(make_agent(args, uneven_envs([1])), lr=5e-4)
+    script.end_update(args, None, optimizer, {}, kl, 0.02)
+    assert optimizer.param_groups[0]["lr"] == pytest.approx(rate)
+    for _ in range(50):
+        script.end_update(args, None, optimizer, {}, kl, 0.02)
+    assert optimizer.param_groups[0]["lr"] == pytest.approx(1e-3 if rate > 5e-4 else 1e-5 if rate < 5e-4 else 5e-4)
+
+
+@pytest.mark.parametrize("hits, factor", [(17, 0.9), (16, 1.0)])
+def test_gated_noise_falls_only_with_success(uneven_envs, hits, factor):
+    """17 of 20 episodes are 85 %; the floor is --log-std-final."""
+    args = make_args(noise="gated", noise_decay=0.9, log_std=-0.5, log_std_final=-1.0)
+    agent = make_agent(args, uneven_envs([1]))
+    optimizer, episodes = RecordingAdam(agent), {"hit": np.arange(20)[:, None] < hits}
+    script.end_update(args, agent, optimizer, episodes, 0.0, None)
+    assert agent.actor_logstd.item() == pytest.approx(-0.5 + math.log(factor))
+    for _ in range(20):
+        script.end_update(args, agent, optimizer, episodes, 0.0, None)
+    assert agent.actor_logstd.item() == pytest.approx(-1.0 if factor < 1 else -0.5)
+
+
+@pytest.mark.parametrize("noise", ["learned", "schedule", "gated"])
+def test_only_learned_noise_is_learned(learner, noise):
+    run = learner(noise=noise)
+    before = run.agent.actor_logstd.clone()
+    run.update()
+    assert torch.equal(run.agent.actor_logstd, before) == (noise != "learned")
+
+
+# --- returns normalised by time ---------------------------------------------------------------------------------------
+
+
+def monte_carlo(rewards, lengths, gamma):
+    """Discounted sums of the rewards to come, (T, N), NaN beyond an episode's end."""
+    returns = np.full(rewards.shape, np.nan)
+    for n, end in enumerate(lengths):
+        for t in range(end):
+            returns[t, n] = sum(gamma**k * rewards[t + k, n] for k in range(end - t))
+    return returns
+
+
+def test_return_norm_time(learner):
+    """Two updates by hand: statistics 0.7 old + 0.3 new, the critic's targets, and V in the advantages."""
+    run = learner(return_norm="time", gamma=0.9, gae_lambda=0.8, norm_adv=False)
+    lengths, means, spreads = run.envs.lengths, [], []
+    for _ in range(2):
+        rewards, critic = run.batch.rewards.numpy().copy(), run.batch.values.numpy().copy()
+        returns = monte_carlo(rewards, lengths, 0.9)
+        means.append(np.nanmean(returns, axis=1, keepdims=True))
+        spreads.append(np.nanstd(returns, axis=1, keepdims=True))
+        mean, spread = means[0], spreads[0]
+        for later_mean, later_spread in zip(means[1:], spreads[1:]):
+            mean, spread = 0.7 * mean + 0.3 * later_mean, 0.7 * spread + 0.3 * later_spread
+        std = np.sqrt(spread**2 + (0.3 * spread.mean()) ** 2 + 1e-8)
+        script.prepare(run.batch, run.norm, run.args)
+        alive = np.isfinite(returns)
+        np.testing.assert_allclose(run.batch.returns.numpy()[alive], ((returns - mean) / std)[alive], rtol=1e-9)
+        expected = direct_gae(rewards, mean + std * critic, lengths, 0.9, 0.8)
+        np.testing.assert_allclose(run.batch.advantages.numpy()[alive], expected[alive], rtol=1e-9, atol=1e-12)
+        run.collect()
+
+
+def test_return_norm_keeps_what_no_episode_reached(uneven_envs):
+    """The second update's episodes end earlier: the last steps' statistics stay, and nothing becomes NaN."""
+    norm = script.ReturnNorm(4).double()
+    returns, alive = torch.arange(12.0).double().view(4, 3) ** 2, torch.ones(4, 3).double()
+    norm.observe(returns, alive)
+    before = norm.mean.clone(), norm.spread.clone()
+    alive[2:] = 0
+    norm.observe(torch.ones(4, 3).double(), alive)
+    assert torch.equal(norm.mean[2:], before[0][2:]) and torch.equal(norm.spread[2:], before[1][2:])
+    assert (norm.mean[:2] != before[0][:2]).all() and norm.std.isfinite().all()
 
 
 # --- policy -----------------------------------------------------------------------------------------------------------
@@ -277,10 +375,12 @@ def test_gradient_norm_is_limited(learner, monkeypatch):
     assert len(norms) == 6 and max(norms) == pytest.approx(1e-3, rel=1e-3)
 
 
-@pytest.mark.parametrize("target_kl, epochs", [(None, 5), (1e9, 5), (1e-9, 1)])
-def test_target_kl_ends_the_epochs(learner, minibatches, target_kl, epochs):
-    learner(target_kl=target_kl, update_epochs=5).update()
-    assert len(minibatches) == 2 * epochs
+@pytest.mark.parametrize("target_kl, steps", [(None, 10), (1e9, 10), (1e-9, 1)])
+def test_target_kl_ends_the_update_at_once(learner, target_kl, steps):
+    """The first minibatch has KL 0; the one whose KL is beyond the limit takes no step, whatever epoch it is in."""
+    run = learner(target_kl=target_kl, update_epochs=5)
+    run.update()
+    assert len(run.optimizer.weights) == steps
 
 
 def test_nan_reward_stops_before_the_weights_move(learner):

@@ -117,7 +117,7 @@ def test_lengths(path):
     functions = [node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.FunctionDef)]
     assert not [node.name for node in functions if node.end_lineno - node.lineno + 1 > 40]
     if path in SCRIPTS:
-        assert len(text.splitlines()) <= 600
+        assert len(text.splitlines()) <= 700
 
 
 # Table 1 of the paper: (double integrator, Van der Pol)

@@ -1,0 +1,714 @@
+"""PPO with a Gated Transformer-XL on a four-phase rocket ascent, measured against the true optimum in the same run.
+
+    python ppo_gtrxl_rocket.py --seed 1                                        # fixed 961 s, the paper's problem
+    python ppo_gtrxl_rocket.py --seed 1 --env-id RocketAscentCutoff-v0         # free final time, most mass
+    python ppo_gtrxl_rocket.py --eval-only --checkpoint results/rocket_fixed/agent.safetensors
+
+Top to bottom: arguments, problem, Gated Transformer-XL, agent, PPO, checkpoints, main. From the first
+"Shared" on, all ppo_gtrxl_*.py are the same to the letter. T steps, N environments, L memory, d width, H heads.
+"""
+
+from __future__ import annotations
+
+import copy
+import importlib.util
+import json
+import math
+import sys
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import safetensors.torch
+import torch
+import torch.nn.functional as F
+import tyro
+from torch import nn
+from torch.distributions import Normal
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+from torch.utils.tensorboard import SummaryWriter
+
+import evaluate
+from envs import ROCKET, target_axes, target_orbit
+
+
+@dataclass
+class Args:
+    # experiment
+    exp_name: str = Path(__file__).stem  # the name of this experiment
+    seed: int = 1  # seed of the experiment
+    torch_deterministic: bool = True  # if toggled, `torch.backends.cudnn.deterministic=True`
+    cuda: bool = True  # if toggled, a GPU is used when there is one
+    num_threads: int = 0  # CPU threads of torch (0: torch's own choice)
+    track: bool = False  # if toggled, this experiment will be tracked with Weights and Biases
+    wandb_project_name: str = "ppo-gtrxl"  # the wandb's project name
+    wandb_entity: str | None = None  # the entity (team) of wandb's project
+    capture_video: bool = False  # draw the figures of the final evaluation into the run's folder
+    save_model: bool = True  # write checkpoints and the evaluation (off: TensorBoard events only)
+    checkpoint: str | None = None  # start from these weights (.safetensors)
+    resume: str | None = None  # run folder of an interrupted run to go on with, bit for bit
+    eval_only: bool = False  # fly the mean action of --checkpoint, train nothing, write only --eval-json and --eval-npz
+    eval_starts: int | None = None  # number of evaluation starts (default: 1000 with --eval-only, 50 at a run's end)
+    eval_seed: int = 0  # seed of the evaluation starts
+    eval_json: str | None = None  # where --eval-only writes the metrics
+    eval_npz: str | None = None  # where --eval-only writes the trajectories
+    eval_every: int = 5  # evaluate every so many updates, on starts of its own (0: only at the end)
+
+    # environment
+    env_id: str = "RocketAscent-v0"  # the id of the environment, one of ENV_IDS
+    observe_phase: bool = True  # show time and phase to the policy
+    action_frame: str = "local"  # the thrust direction's axes: local (up, along-track, cross-track) or eci
+    guidance: str = "none"  # early reference pitch of R_guidance: none, linear or knots
+    mass_weight: float = 0.0  # cut-off: reward lost for 100 kg burnt in phase 4, ramped in over the last half
+    reward_scale: float = 0.2  # factor on the rewards in training; everything logged is unscaled
+
+    # transformer (a laptop's; README has Table 1's)
+    num_blocks: int = 2  # number of GTrXL blocks
+    embed_dim: int = 64  # embedding dimension d
+    num_heads: int = 4  # number of attention heads
+    memory_length: int = 32  # memory length L: a step attends to itself and the L steps before it
+    mlp_dim: int = 64  # width of the position-wise MLP
+    hidden_dim: int = 64  # width of the hidden layer of each head
+    memory_noise: float = 0.1  # spread of the memory before an episode's start in training (Algorithm 1, line 5)
+
+    # PPO
+    total_updates: int = 400  # number of updates
+    num_envs: int = 32  # number of parallel environments, each flying one episode per update
+    learning_rate: float = 5e-4  # learning rate of the first update
+    learning_rate_final: float = 1e-5  # learning rate of the last update (linear in between)
+    gamma: float = 1.0  # the discount factor gamma
+    gae_lambda: float = 0.985  # the lambda for the general advantage estimation
+    num_minibatches: int = 8  # the number of mini-batches of whole episodes
+    update_epochs: int = 6  # the K epochs to update the policy
+    norm_adv: bool = True  # normalise the advantages over an update
+    clip_coef: float = 0.2  # the surrogate clipping coefficient
+    ent_coef: float = 0.0  # coefficient of the entropy in the first update
+    ent_coef_final: float = 0.0  # coefficient of the entropy in the last update (linear in between)
+    vf_coef: float = 0.5  # coefficient of the value function
+    max_grad_norm: float = 0.5  # the maximum norm for the gradient clipping
+    target_kl: float | None = 0.03  # KL divergence from which an update takes no further step
+    target_kl_final: float | None = 0.012  # the same in the last update (linear in between; none: --target-kl)
+    lr_schedule: str = "kl"  # linear, or kl: the learning rate follows half of --target-kl between its two ends
+    return_norm: str = "time"  # none, or time: the critic learns returns normalised over the episodes, step by step
+    noise: str = "gated"  # who sets the log-std: learned, schedule (linear), gated (falls when the episodes succeed)
+    log_std: float = -1.4  # initial log of the policy's standard deviation, in the action's unit
+    log_std_final: float = -3.9  # with schedule the last update's, with gated the floor
+    noise_decay: float = 0.985  # gated: factor on the standard deviation after an update whose episodes succeed
+    weight_average: float = 0.999  # decay of the averaged weights used in evaluation (0: off)
+
+
+# Problem: what differs from the other scripts -------------------------------------------------------------------------
+
+ENV_IDS = ("RocketAscent-v0", "RocketAscentCutoff-v0")
+ENV_OPTIONS = ("observe_phase", "action_frame")  # arguments of the environments
+AXES, (H, E) = target_axes(), target_orbit()  # perigee, semi-latus, normal; angular momentum and eccentricity vector
+UNITS = [ROCKET.Re] * 3 + [(ROCKET.mu / ROCKET.Re) ** 0.5] * 3 + [6644.0]  # m, m/s, kg: mu = 1
+TARGET = {"h_target": (AXES @ H / (UNITS[0] * UNITS[3])).tolist(), "e_target": (AXES @ E).tolist()}
+BUFFERS = dict.fromkeys(ENV_IDS, {"axes": AXES.tolist(), "units": UNITS, **TARGET})
+INITIAL_ACTION = [1.0, 0.0, 0.0]  # straight up: a randomly steered rocket never leaves the ground
+
+
+def features(obs, axes, units, h_target, e_target):
+    """What the encoder sees of observations (..., 9): the state in the target orbit's axes, and its error, twice.
+
+    h = r x v, e = v x h - r / |r| (mu = 1), E their distance to the target's; tanh(10 E) lets small errors be seen.
+    """
+    (r, v, m), (t_norm, phase) = (obs[..., :7] / units).split([3, 3, 1], dim=-1), obs[..., 7:].split(1, dim=-1)
+    r, v = r @ axes.T, v @ axes.T
+    distance, h = r.norm(dim=-1, keepdim=True), torch.linalg.cross(r, v)
+    error = torch.cat([(h - h_target) / h_target.norm(), torch.linalg.cross(v, h) - r / distance - e_target], dim=-1)
+    up = (r * v).sum(dim=-1, keepdim=True) / distance
+    shape = [64 * (distance - 1), 8 * up, 64 * r[..., 2:], 8 * v[..., 2:], v.norm(dim=-1, keepdim=True)]  # 100 km, km/s
+    phases = F.one_hot((3 * phase[..., 0]).round().long().clamp(0, 3), 4)
+    return torch.cat([r, v, *shape, t_norm, m.log(), phases, error, (10 * error).tanh()], dim=-1)
+
+
+def set_curriculum(envs, args, progress):
+    """Precision comes first: burning costs nothing until the last half of the updates."""
+    envs.guidance, envs.mass_weight = args.guidance, args.mass_weight * max(0.0, 2 * progress - 1)
+
+
+def succeeded(episodes):
+    """Whether --noise gated lowers the noise: half of the sampled episodes end near the target orbit."""
+    return np.median(episodes["error_norm"]) < 0.03
+
+
+def describe(episodes, metrics):
+    """What a progress line says of the sampled episodes (`final_info` arrays) and of the last evaluation, if any."""
+    line = f"return {episodes['episodic_return'].mean():7.2f}  sampled error {np.median(episodes['error_norm']):.4f}"
+    if not metrics:
+        return line
+    orbit = f"a {metrics['a_km']:.1f} km  e {metrics['e']:.4f}  i {metrics['i_deg']:.2f}"
+    return f"{line}  mean action: error {metrics['error_norm']:.4f}  {orbit}  mass {metrics['final_mass_kg']:.1f} kg"
+
+
+# Shared: Gated Transformer-XL ("Gated Transformer-XL Implementation") -------------------------------------------------
+def linear(inputs, outputs, gain=1.0, bias=0.0):
+    """A linear layer with orthogonal weights and a constant bias (CleanRL's layer_init), or without one (None)."""
+    layer = nn.Linear(inputs, outputs, bias=bias is not None)
+    nn.init.orthogonal_(layer.weight, gain)
+    if bias is not None:
+        nn.init.constant_(layer.bias, bias)
+    return layer
+
+
+class Gate(nn.Module):
+    """gate(x, y) = lambda x + (1 - lambda) y, lambda = sigmoid(W_g [x, y] + b_g); b_g > 0 begins near the identity."""
+
+    def __init__(self, embed_dim):
+        super().__init__()
+        self.linear = linear(2 * embed_dim, embed_dim, bias=2.0)
+
+    def forward(self, x, y):
+        lam = torch.sigmoid(self.linear(torch.cat([x, y], dim=-1)))
+        return torch.lerp(y, x, lam)
+
+
+class RelativeAttention(nn.Module):
+    """Multi-head attention over a sliding window: A_ij = (x_i W^Q) (x_j W^K + R_{i-j})^T / sqrt(d_k), i - L <= j <= i.
+
+    R is learned, one vector for each head and distance 0..L; j runs over [memory; segment].
+    """
+
+    def __init__(self, embed_dim, num_heads, memory_length):
+        super().__init__()
+        self.num_heads, self.memory_length, self.dk = num_heads, memory_length, embed_dim // num_heads
+        self.query, self.key, self.value, self.out = (linear(embed_dim, embed_dim, bias=None) for _ in range(4))
+        self.R = nn.Parameter(torch.zeros(num_heads, memory_length + 1, self.dk))
+
+    def forward(self, x, memory):
+        """The whole segment at once: x (N, T, d), memory (N, L, d) -> (N, T, d).
+
+        Queries in chunks of C <= max(L, 16) steps, each against its own window of L + C keys: linear in T.
+        """
+        (N, T, d), L, H, dk = x.shape, self.memory_length, self.num_heads, self.dk
+        chunks = math.ceil(T / max(L, 16))
+        C = math.ceil(T / chunks)
+        pad = (0, 0, 0, chunks * C - T)
+        context = torch.cat([memory, x], dim=1)  # (N, L + T, d)
+        q = F.pad(self.query(x) / math.sqrt(dk), pad).view(N, chunks, C, H, dk).transpose(2, 3)  # (N, chunks, H, C, dk)
+        k, v = (F.pad(map_(context), pad).unfold(1, L + C, C).unflatten(2, (H, dk)) for map_ in (self.key, self.value))
+        scores = q @ k + self.position_scores(q)  # k, v (N, chunks, H, dk, L + C), scores (N, chunks, H, C, L + C)
+        attended = scores.softmax(dim=-1) @ v.transpose(-1, -2)  # (N, chunks, H, C, dk)
+        return self.out(attended.transpose(2, 3).reshape(N, chunks * C, d)[:, :T])
+
+    def position_scores(self, q):
+        """q_i R_{i-j}^T of q (N, chunks, H, C, dk) under the keys of its window, -inf elsewhere: (..., C, L + C).
+
+        Row i belongs under keys i..i+L (distance L..0): padded with C times -inf and cut anew, it moves right by i.
+        """
+        C, L = q.shape[-2], self.memory_length
+        products = F.pad(torch.einsum("nchqd,hld->nchql", q, self.R.flip(1)), (0, C), value=-torch.inf)
+        return products.flatten(-2)[..., : C * (L + C)].unflatten(-1, (C, L + C))
+
+    def start_cache(self, memory, steps):
+        """Keys and values of the memory (N, L, d), with room for `steps` more: (2, N, H, L + steps, dk)."""
+        kv = torch.stack([self.key(memory), self.value(memory)]).unflatten(-1, (self.num_heads, self.dk))
+        return F.pad(kv.transpose(2, 3), (0, 0, 0, steps))
+
+    def step(self, x, cache, t):
+        """Step t alone: x (N, d) -> (N, d); writes its key and value into the cache, reads the window before it."""
+        L, heads = self.memory_length, (-1, self.num_heads, 1, self.dk)
+        q = self.query(x).view(heads) / math.sqrt(self.dk)  # (N, H, 1, dk)
+        cache[:, :, :, t + L : t + L + 1] = torch.stack([self.key(x).view(heads), self.value(x).view(heads)])
+        k, v = cache[:, :, :, t : t + L + 1]  # (N, H, L + 1, dk)
+        scores = q @ (k + self.R.flip(1)).transpose(-1, -2)  # (N, H, 1, L + 1)
+        return self.out((scores.softmax(dim=-1) @ v).flatten(1))
+
+
+class GTrXLBlock(nn.Module):
+    """h1 = gate(x, LayerNorm(x + MultiHead(x))), h2 = gate(h1, LayerNorm(h1 + MLP(h1)))."""
+
+    def __init__(self, embed_dim, num_heads, memory_length, mlp_dim):
+        super().__init__()
+        self.attention = RelativeAttention(embed_dim, num_heads, memory_length)
+        self.norm1, self.norm2 = nn.LayerNorm(embed_dim), nn.LayerNorm(embed_dim)
+        self.gate1, self.gate2 = Gate(embed_dim), Gate(embed_dim)
+        self.mlp = nn.Sequential(linear(embed_dim, mlp_dim), nn.GELU(), linear(mlp_dim, embed_dim))
+
+    def forward(self, x, attended):
+        """x is the block's input, `attended` its MultiHead(x), of the whole segment or of one step."""
+        h1 = self.gate1(x, self.norm1(x + attended))
+        return self.gate2(h1, self.norm2(h1 + self.mlp(h1)))
+
+
+# Shared: agent ("Architecture Overview": encoder, GTrXL, policy head, value head) -------------------------------------
+class Agent(nn.Module):
+    """Actor and critic on one GTrXL trunk. The policy is Gaussian with a learned, state-independent log-std."""
+
+    def __init__(self, args, envs):
+        super().__init__()
+        d, hidden, actions = args.embed_dim, args.hidden_dim, envs.single_action_space.shape[0]
+        self.num_blocks, self.memory_length, self.embed_dim = args.num_blocks, args.memory_length, d
+        self.constants = list(BUFFERS[args.env_id])
+        for name, value in BUFFERS[args.env_id].items():
+            self.register_buffer(name, torch.tensor(value))
+        self.register_buffer("action_scale", torch.tensor(envs.single_action_space.high, dtype=torch.float32))
+        inputs = len(self.features(torch.ones(envs.single_observation_space.shape)))
+        self.encoder = nn.Sequential(linear(inputs, d, gain=2**0.5), nn.GELU())
+        sizes = d, args.num_heads, args.memory_length, args.mlp_dim
+        self.blocks = nn.ModuleList(GTrXLBlock(*sizes) for _ in range(args.num_blocks))
+        self.actor = nn.Sequential(linear(d, hidden, gain=2**0.5), nn.GELU(), linear(hidden, actions, gain=0.01))
+        self.actor[-1].bias.data = torch.tensor(INITIAL_ACTION)
+        self.critic = nn.Sequential(linear(d, hidden, gain=2**0.5), nn.GELU(), linear(hidden, 1))
+        self.actor_logstd = nn.Parameter(torch.full((actions,), args.log_std), requires_grad=args.noise == "learned")
+
+    def features(self, obs):
+        """The problem's `features`, with its constants out of the checkpoint."""
+        return features(obs, *(getattr(self, name) for name in self.constants))
+
+    def new_memory(self, num_envs, noise):
+        """m_0 ~ N(0, noise^2), drawn once per episode and block: (blocks, N, L, d)."""
+        zeros = self.actor_logstd.new_zeros(self.num_blocks, num_envs, self.memory_length, self.embed_dim)
+        return zeros.normal_(std=noise) if noise else zeros  # an evaluation must not move the random stream
+
+    def encode(self, obs, memory):
+        """Whole episodes in parallel (training): obs (N, T, obs), memory (blocks, N, L, d) -> hidden (N, T, d)."""
+        x = self.encoder(self.features(obs))
+        for block, block_memory in zip(self.blocks, memory):
+            x = block(x, block.attention(x, block_memory))
+        return x
+
+    @torch.no_grad()
+    def start_cache(self, memory, steps):
+        """The key/value caches with which `encode_step` begins episodes of at most `steps` steps."""
+        return [block.attention.start_cache(m, steps) for block, m in zip(self.blocks, memory)]
+
+    def encode_step(self, obs, cache, t):
+        """Step t of the same episodes (rollout): obs (N, obs) -> hidden (N, d); its cost does not grow with t."""
+        x = self.encoder(self.features(obs))
+        for block, block_cache in zip(self.blocks, cache):
+            x = block(x, block.attention.step(x, block_cache, t))
+        return x
+
+    def get_mean_action(self, hidden):
+        """The policy's mean in the action's unit; the environment clips it at the bound."""
+        return self.actor(hidden) * self.action_scale
+
+    def get_action_and_value(self, hidden, action=None):
+        """Sample (or take) the action: its value, log-probability, the policy's entropy and the critic's output."""
+        logstd = self.actor_logstd.clamp(-5.0, 0.5)
+        mean = self.get_mean_action(hidden)
+        probs = Normal(mean, logstd.exp().expand_as(mean), validate_args=False)
+        action = probs.sample() if action is None else action
+        return action, probs.log_prob(action).sum(-1), probs.entropy().sum(-1), self.critic(hidden).squeeze(-1)
+
+
+# Shared: PPO (Algorithm 1) --------------------------------------------------------------------------------------------
+@dataclass
+class Batch:
+    """The episodes of one update; `alive` is 1 for steps before an episode's end, 0 after it."""
+
+    obs: torch.Tensor  # (T, N, obs)
+    actions: torch.Tensor  # (T, N, actions)
+    logprobs: torch.Tensor  # (T, N)
+    rewards: torch.Tensor  # (T, N), scaled
+    values: torch.Tensor  # (T, N), the critic's output
+    alive: torch.Tensor  # (T, N)
+    memory: torch.Tensor  # (blocks, N, L, d)
+    advantages: torch.Tensor | None = None  # (T, N), filled by update, as the returns
+    returns: torch.Tensor | None = None  # (T, N), the critic's target
+
+
+class ReturnNorm(nn.Module):
+    """V(s, t) = mean_t + std_t critic(s): the mean and spread over episodes of the return from each step on.
+
+    All episodes share the clock, and what differs between them is small beside what the steps to go bring.
+    """
+
+    def __init__(self, steps):
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(steps, 1))
+        self.register_buffer("std", torch.ones(steps, 1))
+        self.register_buffer("spread", torch.zeros(steps, 1))  # before the floor that `std` has
+
+    def observe(self, returns, alive):
+        """Move towards the statistics of the returns (T, N) of one update's episodes; a step no one lived to stays."""
+        count = alive.sum(dim=1, keepdim=True)
+        mean = (returns * alive).sum(dim=1, keepdim=True) / count.clamp(min=1)
+        spread = (((returns - mean) ** 2 * alive).sum(dim=1, keepdim=True) / count.clamp(min=1)).sqrt()
+        weight = (1 - 0.7 * (self.spread > 0).to(mean)) * (count > 0)  # the first update's statistics count in full
+        self.mean.lerp_(mean, weight)
+        self.spread.lerp_(spread, weight)
+        self.std.copy_((self.spread**2 + (0.3 * self.spread.mean()) ** 2 + 1e-8).sqrt())
+
+
+@torch.no_grad()
+def rollout(agent, envs, reward_scale, memory_noise):
+    """One episode in each environment (Algorithm 1, lines 4-11): the Batch and the episodes' `final_info`."""
+    T, N, like = envs.episode_steps, envs.num_envs, agent.actor_logstd
+    shapes = envs.single_observation_space.shape, envs.single_action_space.shape, (), (), (), ()
+    batch = Batch(*(like.new_zeros(T, N, *shape) for shape in shapes), agent.new_memory(N, memory_noise))
+    cache = agent.start_cache(batch.memory, T)
+    alive, episodes, (next_obs, _) = np.ones(N, dtype=bool), {}, envs.reset()
+    batch.obs[:] = torch.as_tensor(next_obs)  # steps that nobody lives to are computed, too: they need a real state
+    for t in range(T):
+        batch.obs[t], batch.alive[t] = torch.as_tensor(next_obs), torch.as_tensor(alive)
+        hidden = agent.encode_step(batch.obs[t], cache, t)
+        batch.actions[t], batch.logprobs[t], _, batch.values[t] = agent.get_action_and_value(hidden)
+        next_obs, reward, terminated, _, info = envs.step(batch.actions[t].cpu().numpy())
+        batch.rewards[t] = torch.as_tensor(reward * alive * reward_scale)
+        ended = alive & terminated
+        for key, value in info.get("final_info", {}).items():
+            episodes.setdefault(key, value.copy())[ended] = value[ended]
+        alive = alive & ~terminated  # an ended environment has started anew; only its first episode counts
+        if not alive.any():
+            break
+    return batch, episodes
+
+
+def gae(rewards, values, alive, gamma, gae_lambda):
+    """A_t = sum_l (gamma lambda)^l delta_{t+l} and the returns A + V, all (T, N); V is 0 beyond an episode's end."""
+    advantages, lastgaelam = torch.zeros_like(rewards), 0.0
+    next_value, next_alive = torch.zeros_like(values[0]), torch.zeros_like(alive[0])
+    for t in reversed(range(len(rewards))):
+        delta = rewards[t] + gamma * next_value * next_alive - values[t]
+        advantages[t] = lastgaelam = (delta + gamma * gae_lambda * next_alive * lastgaelam) * alive[t]
+        next_value, next_alive = values[t], alive[t]
+    return advantages, advantages + values
+
+
+def ppo_loss(agent, batch, mb, args, ent_coef):
+    """-L_CLIP + c1 L_VF - c2 H over the living steps of the episodes `mb`; returns it and what is logged."""
+    alive, advantages = batch.alive[:, mb], batch.advantages[:, mb]
+    mean = lambda x: (x * alive).sum() / alive.sum()  # noqa: E731
+    hidden = agent.encode(batch.obs[:, mb].transpose(0, 1), batch.memory[:, mb]).transpose(0, 1)
+    _, newlogprob, entropy, newvalue = agent.get_action_and_value(hidden, batch.actions[:, mb])
+    logratio = newlogprob - batch.logprobs[:, mb]
+    ratio = logratio.exp()
+    clipped = torch.clamp(ratio, 1 - args.clip_coef, 1 + args.clip_coef)
+    pg_loss = mean(torch.max(-advantages * ratio, -advantages * clipped))
+    v_loss = mean(0.5 * (newvalue - batch.returns[:, mb]) ** 2)
+    entropy_loss = mean(entropy)
+    loss = pg_loss - ent_coef * entropy_loss + args.vf_coef * v_loss
+    losses = {"policy_loss": pg_loss, "value_loss": v_loss, "entropy": entropy_loss, "total_loss": loss}
+    with torch.no_grad():  # http://joschu.net/blog/kl-approx.html
+        losses |= {"old_approx_kl": mean(-logratio), "approx_kl": mean((ratio - 1) - logratio)}
+        losses["clipfrac"] = mean(((ratio - 1.0).abs() > args.clip_coef).to(ratio.dtype))
+    return loss, {name: value.detach() for name, value in losses.items()}
+
+
+def prepare(batch, norm, args):
+    """Fill in advantages and the critic's targets (Algorithm 1, lines 12-13); returns the explained variance."""
+    monte_carlo, _ = gae(batch.rewards, torch.zeros_like(batch.values), batch.alive, args.gamma, 1.0)
+    if args.return_norm == "time":
+        norm.observe(monte_carlo, batch.alive)
+    values, valid = norm.mean + norm.std * batch.values, batch.alive.bool()
+    batch.advantages, returns = gae(batch.rewards, values, batch.alive, args.gamma, args.gae_lambda)
+    batch.returns = ((monte_carlo if args.return_norm == "time" else returns) - norm.mean) / norm.std
+    if args.norm_adv:
+        adv = batch.advantages[valid]
+        batch.advantages = (batch.advantages - adv.mean()) / (adv.std() + 1e-8)
+    return 1 - (returns - values)[valid].var() / returns[valid].var()
+
+
+def update(agent, average, optimizer, norm, batch, args, ent_coef, target_kl):
+    """K epochs of minibatches of whole episodes (Algorithm 1, lines 14-19); returns the mean of each logged loss.
+
+    Raises FloatingPointError, before the optimiser moves the weights, when a loss or the gradient is not finite.
+    """
+    explained_variance, log, N = prepare(batch, norm, args), [], batch.alive.shape[1]
+    orders = [torch.randperm(N, device=batch.alive.device) for _ in range(args.update_epochs)]
+    minibatches = [(k + 1, mb) for order in orders for k, mb in enumerate(order.tensor_split(args.num_minibatches))]
+    for minibatch, mb in minibatches:
+        loss, losses = ppo_loss(agent, batch, mb, args, ent_coef)
+        log.append(losses)
+        if target_kl is not None and losses["approx_kl"] > target_kl:
+            break
+        optimizer.zero_grad()
+        loss.backward()
+        gradient = nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
+        for name, value in {**losses, "gradient norm": gradient}.items():
+            if not value.isfinite():
+                epoch = (len(log) - 1) // args.num_minibatches + 1
+                raise FloatingPointError(f"{name} is {value} in epoch {epoch}, minibatch {minibatch}")
+        optimizer.step()
+        average.update_parameters(agent)
+    means = {name: torch.stack([losses[name] for losses in log]).mean() for name in losses}
+    return {name: value.item() for name, value in {**means, "explained_variance": explained_variance}.items()}
+
+
+def linear_schedule(first, last, iteration, total):
+    """`first` in iteration 1, `last` in iteration `total`, linear in between."""
+    return first + (last - first) * (iteration - 1) / max(total - 1, 1)
+
+
+def begin_update(args, agent, optimizer, envs, span):
+    """Set what follows a schedule; returns this update's entropy coefficient and KL limit. span: iteration, total."""
+    if args.lr_schedule == "linear":
+        optimizer.param_groups[0]["lr"] = linear_schedule(args.learning_rate, args.learning_rate_final, *span)
+    if args.noise == "schedule":
+        agent.actor_logstd.fill_(linear_schedule(args.log_std, args.log_std_final, *span))
+    set_curriculum(envs, args, linear_schedule(0.0, 1.0, *span))
+    target_kl = args.target_kl and linear_schedule(args.target_kl, args.target_kl_final or args.target_kl, *span)
+    return linear_schedule(args.ent_coef, args.ent_coef_final, *span), target_kl
+
+
+def end_update(args, agent, optimizer, episodes, approx_kl, target_kl):
+    """Set what follows this update: the learning rate its KL (kl), the noise its episodes (gated)."""
+    group = optimizer.param_groups[0]
+    if args.lr_schedule == "kl":
+        factor = 1 / 1.3 if approx_kl > 0.75 * target_kl else 1.2 if approx_kl < target_kl / 3 else 1.0
+        group["lr"] = min(max(group["lr"] * factor, args.learning_rate_final), args.learning_rate)
+    if args.noise == "gated" and succeeded(episodes):
+        agent.actor_logstd.add_(math.log(args.noise_decay)).clamp_(min=args.log_std_final)
+
+
+# Shared: arguments ----------------------------------------------------------------------------------------------------
+RANGES = {  # lowest and highest value of every numeric flag; NaN and infinity are outside
+    **dict.fromkeys(["seed", "eval_seed", "num_threads", "eval_every"], (0, 2**31 - 1)),
+    **dict.fromkeys(["total_updates", "num_envs", "num_minibatches", "update_epochs", "radius_curriculum"], (1, 10**6)),
+    **dict.fromkeys(["embed_dim", "num_heads", "mlp_dim", "hidden_dim"], (1, 8192)),
+    **dict.fromkeys(["learning_rate", "learning_rate_final", "clip_coef", "weight_average"], (0.0, 1.0)),
+    **dict.fromkeys(["gamma", "gae_lambda", "memory_noise"], (0.0, 1.0)),
+    **dict.fromkeys(["ent_coef", "ent_coef_final", "vf_coef", "mass_weight"], (0.0, 1e3)),
+    **dict.fromkeys(["reward_scale", "max_grad_norm", "target_kl", "target_kl_final"], (1e-9, 1e9)),
+    **dict.fromkeys(["log_std", "log_std_final"], (-5.0, 0.5)),
+    **{"eval_starts": (10, 10**6), "num_blocks": (1, 64), "memory_length": (0, 8192), "noise_decay": (0.1, 1.0)},
+}
+CHOICES = {"env_id": ENV_IDS, "action_frame": ("local", "eci"), "guidance": ("none", "linear", "knots")}
+CHOICES |= {"lr_schedule": ("linear", "kl"), "return_norm": ("none", "time"), "noise": ("learned", "schedule", "gated")}
+NETWORK = ["num_blocks", "embed_dim", "num_heads", "memory_length", "mlp_dim", "hidden_dim"]
+POLICY = {name: type(getattr(Args, name)) for name in ["env_id", *ENV_OPTIONS, *NETWORK]}  # a checkpoint decides
+
+
+def fail(message):
+    """End with one line on stderr and exit status 1."""
+    sys.exit(f"error: {' '.join(str(message).split())}")
+
+
+def refuse(name, value, allowed):
+    """End with one line that names a field of Args as its flag, its value and what is allowed."""
+    fail(f"--{name.replace('_', '-')} {value}: {allowed}")
+
+
+def parse_args(argv):
+    """The checked arguments; with --resume the saved training state, with --checkpoint what that file holds."""
+    args, saved = tyro.cli(Args, args=argv), None
+    typed = {word.split("=")[0][2:].replace("-", "_").removeprefix("no_") for word in argv if word.startswith("--")}
+    if args.resume is not None:
+        if refused := typed - {"resume", "cuda", "num_threads"}:
+            refuse(min(refused), "", "only --cuda and --num-threads may be given beside --resume")
+        saved = load_state(args.resume)
+        args = Args(**{**saved["args"], **{name: getattr(args, name) for name in typed}})
+    elif args.checkpoint is not None:
+        saved = evaluate.read_checkpoint(args.checkpoint, POLICY)
+        for name in POLICY:
+            value, given = saved["args"][name], getattr(args, name)
+            if name == "env_id" and name in typed and value != given and BUFFERS.get(value) == BUFFERS.get(given):
+                print(f"--checkpoint is of {value}; it goes on with {given}")
+            elif name in typed and value != given:
+                refuse(name, given, f"the checkpoint has {value}; leave the flag out")
+            else:
+                setattr(args, name, value)
+    elif args.eval_only:
+        refuse("checkpoint", None, "must name the agent.safetensors that --eval-only flies")
+    check_args(args, typed)
+    args.eval_starts = args.eval_starts or (1000 if args.eval_only else 50)
+    return args, saved
+
+
+def check_args(args, typed):
+    """Refuse what no run can use: SystemExit with one line that names the flag, the value and what is allowed."""
+    for name, value in vars(args).items():
+        if name in RANGES and value is not None and not RANGES[name][0] <= value <= RANGES[name][1]:
+            refuse(name, value, f"must be between {RANGES[name][0]} and {RANGES[name][1]}")
+        if name in CHOICES and value not in CHOICES[name]:
+            refuse(name, value, f"must be one of {', '.join(CHOICES[name])}")
+    if args.lr_schedule == "kl" and args.target_kl is None:
+        refuse("lr_schedule", args.lr_schedule, "needs --target-kl")
+    if args.embed_dim % args.num_heads:
+        refuse("num_heads", args.num_heads, f"must divide --embed-dim {args.embed_dim}")
+    for name in ("eval_json", "eval_npz"):
+        path = getattr(args, name)
+        if path is not None and not (args.eval_only and Path(path).parent.is_dir()):
+            refuse(name, path, "only with --eval-only, and must be in an existing folder")
+    if args.track and importlib.util.find_spec("wandb") is None:
+        refuse("track", "", "needs wandb: pip install wandb")
+    if args.num_minibatches > args.num_envs:
+        if "num_minibatches" in typed:
+            refuse("num_minibatches", args.num_minibatches, f"must be at most --num-envs {args.num_envs}")
+        print(f"--num-minibatches lowered from {args.num_minibatches} to --num-envs {args.num_envs}")
+        args.num_minibatches = args.num_envs
+
+
+# Shared: checkpoints --------------------------------------------------------------------------------------------------
+def training_state(args, modules, envs, progress):
+    """All that a bit-exact resume needs, copied, so that training can go on while it is kept."""
+    modules = {name: module.state_dict() for name, module in modules.items()}
+    rng = {"torch": torch.get_rng_state(), "envs": json.dumps(envs.np_random.bit_generator.state)}
+    rng["cuda"] = torch.cuda.get_rng_state_all()
+    return copy.deepcopy({"args": {**asdict(args), "resume": None}, "progress": progress, "rng": rng, **modules})
+
+
+def restore(state, run_dir, modules, envs):
+    """Put everything back where `training_state` found it; returns the progress. One line if something does not fit."""
+    try:
+        for name, module in modules.items():
+            module.load_state_dict(state[name])
+        torch.set_rng_state(state["rng"]["torch"])
+        torch.cuda.set_rng_state_all(state["rng"]["cuda"][: torch.cuda.device_count()])
+        envs.np_random.bit_generator.state = json.loads(state["rng"]["envs"])
+        return {name: state["progress"][name] for name in ("seed", "total_updates", "global_step", "wall_seconds")}
+    except (KeyError, RuntimeError, TypeError, ValueError) as error:
+        fail(f"--resume {run_dir}: its training_state.pt does not fit its own args ({error}); it must be whole")
+
+
+def load_state(run_dir):
+    """The training state of a run folder; one line if there is none, or it is damaged or another script's."""
+    try:
+        state = torch.load(Path(run_dir) / "training_state.pt", map_location="cpu", weights_only=True)
+        if state["args"].keys() != asdict(Args()).keys() or state["args"]["env_id"] not in ENV_IDS:
+            raise ValueError("of another script")
+    except Exception as error:  # a missing, damaged or foreign file fails in many ways, all alike to the user
+        fail(f"--resume {run_dir}: must hold a training_state.pt of {Path(__file__).name} ({error})")
+    return state
+
+
+def save_run(run_dir, state):
+    """Write the training state and, derived from it, the weights that evaluation uses; each whole or not at all."""
+    with evaluate.replacing(run_dir / "training_state.pt") as file:
+        torch.save(state, file)
+    metadata = {"env_id": state["args"]["env_id"], "args": json.dumps(state["args"]), **state["progress"]}
+    weights = {k.removeprefix("module."): v.cpu() for k, v in state["average"].items() if k != "n_averaged"}
+    data = safetensors.torch.save(weights, {key: str(value) for key, value in metadata.items()})
+    evaluate.write_bytes(run_dir / "agent.safetensors", data)
+
+
+# Shared: evaluation, training, main -----------------------------------------------------------------------------------
+SAVE_EVERY = 10  # updates
+TRAINING_EVAL_SEED = 2**31  # beyond --eval-seed: no reported start is flown during training
+
+
+def evaluate_agent(agent, args, envs, eval_seed, progress):
+    """Fly the mean action, from noise-free memory, and the optimum: eval.json's metrics and eval.npz's arrays."""
+    like, cache = agent.actor_logstd, []
+
+    @torch.no_grad()
+    def policy(obs, t):
+        if t == 0:
+            cache[:] = agent.start_cache(agent.new_memory(len(obs), noise=0.0), envs.episode_steps)
+        hidden = agent.encode_step(torch.as_tensor(obs, dtype=like.dtype, device=like.device), cache, t)
+        return agent.get_mean_action(hidden).cpu().numpy()
+
+    options = {name: getattr(args, name) for name in ENV_OPTIONS}
+    metrics, arrays = evaluate.evaluate(args.env_id, policy, eval_seed, args.eval_starts, **options)
+    return {**metrics, **progress, "device": like.device.type, "torch_version": torch.__version__}, arrays
+
+
+def log_scalars(writer, prefix, values, global_step):
+    """Write every number of `values` under its TensorBoard tag."""
+    for name, value in values.items():
+        if isinstance(value, (int, float)):
+            writer.add_scalar(f"{prefix}/{name}", value, global_step)
+
+
+def log_update(writer, args, progress, batch, episodes, losses, learning_rate, metrics):
+    """CleanRL's tags for one update and, with each evaluation or a hundred times a run, a line to follow it by."""
+    iteration, total, seconds = progress["total_updates"], args.total_updates, progress["wall_seconds"]
+    charts = {"episodic_return": episodes["episodic_return"].mean().item(), "learning_rate": learning_rate}
+    charts |= {"episodic_length": batch.alive.sum(dim=0).mean().item(), "SPS": int(progress["global_step"] / seconds)}
+    log_scalars(writer, "charts", charts, progress["global_step"])
+    log_scalars(writer, "losses", losses, progress["global_step"])
+    if iteration % (args.eval_every or max(1, total // 100)) == 0 or iteration == 1:
+        clock = f"{seconds / 60:.1f} min gone, {(total - iteration) * seconds / iteration / 60:.1f} to go"
+        steps = f"{progress['global_step']} steps"
+        print(f"update {iteration}/{total}, {steps}, {clock}: {describe(episodes, metrics)}", flush=True)
+
+
+def train(args, modules, envs, writer, run_dir, progress):
+    """Algorithm 1; returns the training state after the last whole update, which Ctrl-C makes the last one."""
+    agent, average, optimizer, norm = modules.values()
+    state, metrics = training_state(args, modules, envs, progress), {}
+    try:
+        for iteration in range(progress["total_updates"] + 1, args.total_updates + 1):
+            start = time.time()
+            ent_coef, target_kl = begin_update(args, agent, optimizer, envs, (iteration, args.total_updates))
+            learning_rate = optimizer.param_groups[0]["lr"]
+            batch, episodes = rollout(agent, envs, args.reward_scale, args.memory_noise)
+            losses = update(agent, average, optimizer, norm, batch, args, ent_coef, target_kl)
+            end_update(args, agent, optimizer, episodes, losses["approx_kl"], target_kl)
+            progress = {**progress, "total_updates": iteration}
+            progress["global_step"] += int(batch.alive.sum())
+            progress["wall_seconds"] += time.time() - start
+            state = training_state(args, modules, envs, progress)
+            if args.save_model and iteration % SAVE_EVERY == 0:
+                save_run(run_dir, state)
+            if args.eval_every and iteration % args.eval_every == 0:
+                metrics, _ = evaluate_agent(average.module, args, envs, TRAINING_EVAL_SEED, progress)
+                log_scalars(writer, "eval", metrics, progress["global_step"])
+            log_update(writer, args, progress, batch, episodes, losses, learning_rate, metrics)
+    except KeyboardInterrupt:
+        pass  # `state` is that of the last whole update
+    except FloatingPointError as error:
+        if args.save_model:
+            save_run(run_dir, state)
+        kept = f"; the last good checkpoint is {run_dir}/training_state.pt" if args.save_model else ""
+        fail(f"update {iteration}: {error}, must be finite{kept}")
+    return state
+
+
+def run(args, agent, envs, saved):
+    """Train (or go on), save, evaluate, print the table."""
+    run_dir = Path(args.resume or f"runs/{args.env_id}__{args.exp_name}__{args.seed}__{int(time.time())}")
+    average = AveragedModel(agent, multi_avg_fn=get_ema_multi_avg_fn(args.weight_average))
+    optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
+    norm = ReturnNorm(envs.episode_steps).to(agent.actor_logstd.device)
+    modules = {"agent": agent, "average": average, "optimizer": optimizer, "norm": norm}
+    progress = {"seed": args.seed, "total_updates": 0, "global_step": 0, "wall_seconds": 0.0}
+    if args.resume is not None:
+        progress = restore(saved, run_dir, modules, envs)
+    if args.track:
+        import wandb
+        names = {"project": args.wandb_project_name, "entity": args.wandb_entity, "name": run_dir.name}
+        wandb.init(**names, sync_tensorboard=True, config=asdict(args), save_code=True)
+    run_dir.mkdir(parents=True, exist_ok=args.resume is not None)
+    evaluate.write_json(run_dir / "args.json", {**asdict(args), "resume": None})
+    writer = SummaryWriter(run_dir, purge_step=progress["global_step"] + 1)
+    state = train(args, modules, envs, writer, run_dir, progress)
+    writer.flush()
+    if args.save_model:
+        save_run(run_dir, state)
+    if (done := state["progress"]["total_updates"]) < args.total_updates:
+        saved = f"go on with: python {Path(__file__).name} --resume {run_dir}" if args.save_model else "nothing saved"
+        print(f"stopped after update {done}; {saved}")
+        sys.exit(130)
+    metrics, arrays = evaluate_agent(average.module, args, envs, args.eval_seed, state["progress"])
+    log_scalars(writer, "eval", metrics, metrics["global_step"])
+    writer.close()
+    if args.save_model:
+        evaluate.write(metrics, arrays, run_dir / "agent.safetensors", run_dir / "eval.json", run_dir / "eval.npz")
+    if args.capture_video:
+        evaluate.figures(run_dir / "figures", arrays, metrics, evaluate.read_curve(run_dir))
+    print(evaluate.table(metrics))
+
+
+def main(argv):
+    args, saved = parse_args(argv)
+    torch.set_num_threads(args.num_threads or torch.get_num_threads())
+    torch.manual_seed(args.seed)
+    torch.backends.cudnn.deterministic = args.torch_deterministic
+    options = {name: getattr(args, name) for name in ENV_OPTIONS}
+    envs = gym.make_vec(args.env_id, num_envs=args.num_envs, **options)
+    envs.reset(seed=args.seed)
+    agent = Agent(args, envs).to("cuda" if torch.cuda.is_available() and args.cuda else "cpu")
+    if args.checkpoint is not None and args.resume is None:
+        try:
+            agent.load_state_dict({name: torch.from_numpy(array) for name, array in saved["tensors"].items()})
+        except RuntimeError as error:
+            fail(f"--checkpoint {args.checkpoint}: its weights do not fit its own args ({error})")
+    if args.eval_only:
+        metrics, arrays = evaluate_agent(agent, args, envs, args.eval_seed, saved["progress"])
+        evaluate.write(metrics, arrays, args.checkpoint, args.eval_json, args.eval_npz)
+        print(evaluate.table(metrics))
+    else:
+        run(args, agent, envs, saved)
+
+
+if __name__ == "__main__":
+    try:
+        main(sys.argv[1:])
+    except (evaluate.BadInput, OSError) as error:
+        fail(error)

@@ -1,0 +1,524 @@
+"""evaluate.py on the rocket: metrics, arrays, table and figures against plain formulas, results folders, bad input."""
+
+import hashlib
+import json
+import math
+
+import numpy as np
+import pytest
+from test_evaluate import command_line, snapshot
+
+import envs
+import evaluate
+
+FIXED, CUTOFF = envs.ROCKETS
+MU, RE = 3.986012e14, 6378145.0
+TARGET = {"a_km": 24361.14, "e": 0.7308, "i_deg": 28.5, "raan_deg": 269.8, "argp_deg": 130.5}
+
+# INTERFACE, "eval.json": all but what the script adds (seed, checkpoint_sha256, total_updates, ...)
+COMMON = {"env_id", "eval_seed", "eval_starts", "episodic_return", "reference_episodic_return"}
+ROCKET = "error_norm perigee_km apogee_km a_error_km e_error i_error_deg raan_error_deg argp_error_deg final_mass_kg"
+ROCKET += " final_time_s mass_ratio reference_mass_kg reference_time_s max_altitude_km success"
+PARTS = {"R_orbital", "R_trajectory", "R_guidance", "R_penalties", "R_terminal"}
+EXTRA = {"points", "crashed", "min_altitude_after_300s_km", "nine_pitch_error_norm", "reference_error_norm"}
+EXTRA |= {f"reference_{key}" for key in (*TARGET, "perigee_km", "apogee_km", "max_altitude_km")}
+KEYS = COMMON | set(ROCKET.split()) | set(TARGET) | PARTS | EXTRA | {"reference_min_altitude_after_300s_km"}
+ARRAYS = {"t", "u", "y", "reward", "t_reference", "u_reference", "y_reference"}
+
+TIMES = [0, 15, 40, 75, 150, 261, 500, 800, 960]  # s
+BY_HAND = [90, 84, 68, 50, 30, 18, 4, -2, -4]  # degrees above the horizon: high, but it reaches the orbit's energy
+LOWER = [90, 82, 65, 46, 28, 18, 5, -1, -4]
+WEAVE = [0, 261, 500, 961], [0, 0, 4, -4]  # s, degrees from the target plane
+
+
+def programme(pitch, times=TIMES, yaw=((0, 961), (0, 0))):
+    """A policy in the local frame that flies a pitch programme (degrees at times in s), and one of yaw."""
+
+    def policy(obs, step):
+        p, y = math.radians(np.interp(2 * step, times, pitch)), math.radians(np.interp(2 * step, *yaw))
+        return 3.0 * np.array([[math.sin(p), math.cos(p) * math.cos(y), math.cos(p) * math.sin(y)]])
+
+    return policy
+
+
+def stub(env_id):
+    """A hand-made reference in the form of `baselines.rocket_reference`."""
+    flight = envs.fly_rocket(env_id, programme(LOWER), action_frame="local")
+    mass, time = flight["final_mass_kg"], flight["final_time_s"]
+    return flight | {"reference_mass_kg": mass, "reference_time_s": time, "nine_pitch_error_norm": 0.0123}
+
+
+@pytest.fixture(scope="module")
+def references():
+    return {env_id: stub(env_id) for env_id in envs.ROCKETS}
+
+
+@pytest.fixture(scope="module")
+def flown(references):
+    """Metrics and arrays by id, of the weaving hand-made programme."""
+    policy = programme(BY_HAND, yaw=WEAVE)
+    return {
+        env_id: evaluate.evaluate(env_id, policy, 3, 50, reference, action_frame="local")
+        for env_id, reference in references.items()
+    }
+
+
+@pytest.fixture(scope="module")
+def crashed(references):
+    return evaluate.evaluate(CUTOFF, programme([-20] * 9), 3, 50, references[CUTOFF], action_frame="local")
+
+
+def dot(a, b):
+    return sum(x * y for x, y in zip(a, b))
+
+
+def cross(a, b):
+    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+
+
+def norm(a):
+    return math.sqrt(dot(a, a))
+
+
+def vectors(y):
+    """Angular momentum and eccentricity vector by the textbook's ((v^2 - mu/r) r - (r . v) v) / mu."""
+    r, v = y[:3].tolist(), y[3:6].tolist()
+    e = [((dot(v, v) - MU / norm(r)) * a - dot(r, v) * b) / MU for a, b in zip(r, v)]
+    return cross(r, v), e
+
+
+def elements(y):
+    """Elements of a state by arc cosines and tests of the quadrant (Curtis, algorithm 4.2), km and degrees."""
+    h, e = vectors(y)
+    node = [-h[1], h[0], 0.0]
+    raan, argp = math.acos(node[0] / norm(node)), math.acos(dot(node, e) / norm(node) / norm(e))
+    raan, argp = raan if node[1] >= 0 else 2 * math.pi - raan, argp if e[2] >= 0 else 2 * math.pi - argp
+    a = 1 / (2 / norm(y[:3]) - dot(y[3:6], y[3:6]) / MU)  # vis viva
+    degrees = [math.degrees(angle) for angle in (math.acos(h[2] / norm(h)), raan, argp)]
+    return dict(zip(TARGET, (a / 1e3, norm(e), *degrees)))
+
+
+def target_frame():
+    """Rows: the target's perigee, semi-latus and normal direction: Rz(argp) Rx(i) Rz(raan)."""
+    raan, i, argp = (math.radians(TARGET[f"{name}_deg"]) for name in ("raan", "i", "argp"))
+    turn = lambda angle: np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])  # noqa: E731
+    about_z, about_x, about_z_first = np.eye(3), np.eye(3), np.eye(3)
+    about_z[:2, :2], about_x[1:, 1:], about_z_first[:2, :2] = turn(argp), turn(i), turn(raan)
+    return about_z @ about_x @ about_z_first
+
+
+def target_vectors():
+    """h and e of the target orbit in the frame above."""
+    return [0, 0, math.sqrt(MU * 24361140.0 * (1 - 0.7308**2))], [0.7308, 0, 0]
+
+
+def errors(y):
+    """The six components of the terminal error in the target's frame."""
+    (h, e), (h_target, e_target), frame = vectors(y), target_vectors(), target_frame()
+    parts = [(a - b) / h_target[2] for a, b in zip(frame @ h, h_target)]
+    return parts + [a - b for a, b in zip(frame @ e, e_target)]
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Metrics and arrays
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("env_id", envs.ROCKETS)
+def test_keys_are_exactly_the_interfaces_and_plain(flown, env_id, tmp_path):
+    metrics, arrays = flown[env_id]
+    assert metrics.keys() == KEYS and arrays.keys() == ARRAYS
+    assert (metrics["env_id"], metrics["eval_seed"], metrics["eval_starts"]) == (env_id, 3, 1)
+    assert {type(value) for value in metrics.values()} == {str, int, float, bool}
+    assert {key for key, value in metrics.items() if type(value) is bool} == {"success", "crashed"}
+    evaluate.write_json(tmp_path / "eval.json", metrics)
+    assert json.loads((tmp_path / "eval.json").read_text()) == metrics
+    evaluate.write_npz(tmp_path / "eval.npz", arrays)
+    with np.load(tmp_path / "eval.npz") as file:
+        assert all(np.array_equal(file[key], arrays[key]) for key in ARRAYS)
+
+
+@pytest.mark.parametrize("env_id", envs.ROCKETS)
+def test_orbit_equals_plain_formulas(flown, references, env_id):
+    metrics, arrays = flown[env_id]
+    end = arrays["y"][-1]
+    for prefix, y in (("", end), ("reference_", references[env_id]["y"][-1])):
+        ours, (h, e) = elements(y), vectors(y)
+        found = {key: metrics[f"{prefix}{key}"] for key in TARGET}
+        assert found == pytest.approx(ours, rel=1e-9)
+        p = dot(h, h) / MU  # the semi-latus rectum
+        apsides = [metrics[f"{prefix}{name}_km"] for name in ("perigee", "apogee")]
+        assert apsides == pytest.approx([(p / (1 + s * norm(e)) - RE) / 1e3 for s in (1, -1)], rel=1e-9)
+        assert metrics[f"{prefix}error_norm"] == pytest.approx(norm(errors(y)), rel=1e-9)
+    ours = elements(end)
+    expected = {
+        "a_error_km": ours["a_km"] - 24361.14,
+        "e_error": ours["e"] - 0.7308,
+        "i_error_deg": ours["i_deg"] - 28.5,
+    }
+    expected |= {"raan_error_deg": ours["raan_deg"] - 269.8, "argp_error_deg": ours["argp_deg"] - 130.5}
+    assert {error: metrics[error] for error in expected} == pytest.approx(expected, abs=1e-9, rel=1e-8)
+    assert metrics["success"] == (norm(errors(end)) < 0.02) == (env_id == CUTOFF)
+    d = norm(errors(end))
+    points = 2000 * (d < 0.02) + 1600 * math.exp(-d / 0.01) + 1600 * math.exp(-d / 0.001)
+    assert metrics["points"] == pytest.approx(points, rel=1e-9)
+
+
+def test_target_vectors_are_those_of_the_decisions(flown):
+    h, e = target_vectors()
+    frame = target_frame()
+    assert frame.T @ h / math.sqrt(MU * RE) == pytest.approx([-0.6365358, 0.0022219, 1.1723603], abs=1e-7)
+    assert frame.T @ e == pytest.approx([0.4900165, 0.4729090, 0.2651594], abs=1e-7)
+
+
+@pytest.mark.parametrize("env_id", envs.ROCKETS)
+def test_mass_time_and_altitudes(flown, references, env_id):
+    metrics, arrays = flown[env_id]
+    for prefix, t, y in (("", arrays["t"], arrays["y"]), ("reference_", *(references[env_id][k] for k in "ty"))):
+        altitudes = [(norm(row[:3]) - RE) / 1e3 for row in y]
+        assert metrics[f"{prefix}max_altitude_km"] == pytest.approx(max(altitudes), rel=1e-9)
+        late = [altitude for altitude, time in zip(altitudes, t) if time > 300]
+        assert metrics[f"{prefix}min_altitude_after_300s_km"] == pytest.approx(min(late), rel=1e-9)
+    burnt = 16820 / 700 * (arrays["t"][-1] - 261)  # 23464 kg are left at 261 s
+    assert metrics["final_mass_kg"] == arrays["y"][-1, 6] == pytest.approx(23464 - burnt, rel=1e-12)
+    assert metrics["final_time_s"] == arrays["t"][-1]
+    assert metrics["mass_ratio"] == metrics["final_mass_kg"] / references[env_id]["final_mass_kg"]
+    assert metrics["reference_time_s"] == references[env_id]["t"][-1]
+    assert not metrics["crashed"]
+
+
+@pytest.mark.parametrize("env_id", envs.ROCKETS)
+def test_arrays_are_the_interfaces(flown, references, env_id):
+    metrics, arrays = flown[env_id]
+    t, u, y = (arrays[key] for key in "tuy")
+    K = len(t) - 1
+    assert u.shape == (K, 3) and y.shape == (K + 1, 7) and arrays["reward"].shape == (K,)
+    assert np.array_equal(t[:-1], 2.0 * np.arange(K)) and 0 < t[-1] - t[-2] <= 2
+    assert y[0] == pytest.approx([5605222.973, 0, 3043387.761, 0, 408.74, 0, 301454], abs=1e-3)
+    assert np.linalg.norm(u, axis=1) == pytest.approx(np.ones(K), abs=1e-12)
+    if env_id == FIXED:
+        assert K == 481 and t[-1] == 961
+    else:
+        energy = dot(y[-1, 3:6], y[-1, 3:6]) / 2 - MU / norm(y[-1, :3])
+        assert energy == pytest.approx(-MU / (2 * 24361140.0), rel=1e-10)
+    again = envs.fly_rocket(env_id, lambda obs, step: 0.7 * u[step : step + 1])  # the default frame is ECI
+    scale = np.array([1e7] * 3 + [1e4] * 3 + [1e5])
+    assert np.abs((again["y"] - y) / scale).max() < 1e-9 and again["t"] == pytest.approx(t, abs=1e-7)
+    assert all(np.array_equal(arrays[f"{key}_reference"], references[env_id][key]) for key in "tuy")
+
+
+@pytest.mark.parametrize("env_id", envs.ROCKETS)
+def test_reward_parts_equal_plain_loops(flown, env_id):
+    metrics, arrays = flown[env_id]
+    t, u, y = (arrays[key].tolist() for key in "tuy")
+    sums, distance = dict.fromkeys(PARTS, 0.0), sum(map(abs, errors(arrays["y"][0])))
+    for k, reward in enumerate(arrays["reward"]):
+        next_distance = sum(map(abs, errors(arrays["y"][k + 1])))
+        altitude = (norm(y[k + 1][:3]) - RE) / 1e3
+        step = {"R_orbital": 10 * (distance - next_distance)}
+        penalty = 0.024 * min(max((altitude - 245) / 100, 0), 1)
+        if t[k + 1] > 300:
+            penalty += 0.024 * min(max((110 - altitude) / 30, 0), 1)
+        if k > 0:
+            penalty += 0.001 * norm([a - b for a, b in zip(u[k], u[k - 1])])
+        step["R_penalties"] = -penalty
+        if k == len(u) - 1:
+            step["R_terminal"] = -2 * math.log(1 + next_distance / 0.01)
+        assert reward == pytest.approx(sum(step.values()), abs=1e-8)
+        for part, value in step.items():
+            sums[part] += value
+        distance = next_distance
+    assert sums["R_penalties"] < -1, "the flight must go too high for the test to mean something"
+    assert {part: metrics[part] for part in PARTS} == pytest.approx(sums, abs=1e-7)
+    assert metrics["episodic_return"] == pytest.approx(sum(sums.values()), abs=1e-7)
+    assert metrics["episodic_return"] == pytest.approx(arrays["reward"].sum(), abs=1e-9)
+
+
+@pytest.mark.parametrize("ours, error", [(269.9, 0.1), (0.5, 90.7), (89.7, 179.9), (90.0, -179.8), (268.8, -1.0)])
+def test_angles_differ_the_short_way_round(references, ours, error):
+    flight = references[CUTOFF] | {"raan_deg": ours}
+    metrics = evaluate.rocket_metrics(flight, references[CUTOFF])
+    assert metrics["raan_error_deg"] == pytest.approx(error, abs=1e-9)
+
+
+@pytest.fixture(scope="module")
+def hyperbolic(references):
+    """The reference's flight, but with 1.5 times the speed at the end: metrics and arrays."""
+    flight = references[FIXED] | {"y": references[FIXED]["y"].copy()}
+    flight["y"][-1, 3:6] *= 1.5
+    flight |= elements(flight["y"][-1]) | {"error_norm": np.float64(norm(errors(flight["y"][-1])))}
+    assert flight["a_km"] < 0 and flight["e"] > 1
+    metrics = {"env_id": FIXED, "eval_seed": 0, "eval_starts": 1} | evaluate.rocket_metrics(flight, references[FIXED])
+    arrays = {
+        f"{key}{side}": run[key] for key in "tuy" for side, run in (("", flight), ("_reference", references[FIXED]))
+    }
+    return metrics, arrays | {"reward": flight["reward"]}
+
+
+def test_hyperbola_has_no_apogee(hyperbolic, tmp_path):
+    metrics, arrays = hyperbolic
+    assert metrics.keys() == KEYS - {"apogee_km"} and not metrics["success"]
+    h, e = vectors(arrays["y"][-1])
+    assert metrics["perigee_km"] == pytest.approx((dot(h, h) / MU / (1 + norm(e)) - RE) / 1e3, rel=1e-9)
+    evaluate.write_json(tmp_path / "eval.json", metrics)
+    (row,) = (line for line in evaluate.table(metrics).splitlines() if "apogee" in line)
+    assert row.split()[-2:] == ["-", "-"]
+    figure = evaluate.draw_orbit(arrays, metrics)
+    reached = lines_of(figure.axes[0])["orbit reached"]
+    assert np.isnan(reached).any() and np.isfinite(reached).any()
+
+
+def test_crash(crashed):
+    metrics, arrays = crashed
+    assert metrics.keys() == KEYS - {"min_altitude_after_300s_km"}
+    assert metrics["crashed"] and not metrics["success"] and metrics["R_penalties"] == pytest.approx(-40)
+    assert norm(arrays["y"][-1, :3]) < RE and metrics["perigee_km"] < -6000
+    table = evaluate.table(metrics)
+    assert "crashed" in table and "nan" not in table and "inf" not in table
+    assert table_row(table, "lowest altitude after 300 s (km)")[2:] == ["-", "-"]
+    assert "crashed" in evaluate.headline(metrics)
+
+
+def test_missing_reference_is_asked_for_once_and_options_reach_the_environment(monkeypatch, references):
+    asked, seen = [], []
+
+    def reference(env_id):
+        asked.append(env_id)
+        return references[env_id]
+
+    def policy(obs, step):
+        seen.append(obs[0])
+        return np.array([[1.0, 0.0, 0.0]])  # up: with action_frame="local" only
+
+    monkeypatch.setattr(evaluate.baselines, "rocket_reference", reference, raising=False)
+    evaluate.optimum.cache_clear()
+    for seed, n in ((1, 10), (2, 50)):
+        metrics, arrays = evaluate.evaluate(CUTOFF, policy, seed, n, action_frame="local", observe_phase=False)
+        assert metrics["eval_seed"] == seed and metrics["reference_mass_kg"] == references[CUTOFF]["reference_mass_kg"]
+    evaluate.optimum.cache_clear()
+    assert asked == [CUTOFF]
+    assert not np.array(seen)[:, 7:].any()
+    radial = arrays["y"][:-1, :3] / np.linalg.norm(arrays["y"][:-1, :3], axis=1)[:, None]
+    assert np.abs(arrays["u"] - radial).max() < 1e-12
+
+
+@pytest.mark.skipif(not hasattr(evaluate.baselines, "rocket_reference"), reason="baselines.py has no rocket yet")
+def test_real_reference():
+    """The optimum of `baselines` fits, and is one: it meets the orbit, and no flight by hand is heavier."""
+    metrics, _ = evaluate.evaluate(CUTOFF, programme(BY_HAND), 0, 1, action_frame="local")
+    assert metrics.keys() == KEYS
+    assert metrics["reference_mass_kg"] == pytest.approx(7529.71, abs=0.1) and metrics["reference_error_norm"] < 1e-3
+    assert metrics["mass_ratio"] < 1 and metrics["nine_pitch_error_norm"] < 0.01
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Table
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def table_row(table, label):
+    """The cells of the row with this label."""
+    (line,) = (line for line in table.splitlines() if line.strip().startswith(label))
+    return line.split(label)[1].split()
+
+
+def test_table_shows_target_optimum_ours_and_difference(flown):
+    metrics = json.loads(json.dumps(flown[CUTOFF][0]))  # eval.json is all it needs
+    table = evaluate.table(metrics)
+    assert table.splitlines()[0].startswith(CUTOFF)
+    assert table.splitlines()[1].split() == ["target", "optimum", "ours", "difference"]
+    perigee, apogee = 24361.14 * (1 - 0.7308) - 6378.145, 24361.14 * (1 + 0.7308) - 6378.145
+    rows = {"semi-major axis a (km)": ("a_km", 24361.14), "eccentricity e": ("e", 0.7308)}
+    rows |= {"inclination i (deg)": ("i_deg", 28.5), "right ascension of the node (deg)": ("raan_deg", 269.8)}
+    rows |= {"argument of perigee (deg)": ("argp_deg", 130.5), "perigee altitude (km)": ("perigee_km", perigee)}
+    rows |= {"apogee altitude (km)": ("apogee_km", apogee)}
+    for label, (key, target) in rows.items():
+        cells = [float(cell) for cell in table_row(table, label)]
+        ours, best = metrics[key], metrics[f"reference_{key}"]
+        assert cells == pytest.approx([target, best, ours, ours - target], abs=6e-4), label
+    rows = {"final mass (kg)": ("final_mass_kg", "reference_mass_kg")}
+    rows |= {"final time (s)": ("final_time_s", "reference_time_s")}
+    rows |= {"maximum altitude (km)": ("max_altitude_km", "reference_max_altitude_km")}
+    key = "min_altitude_after_300s_km"
+    rows |= {"lowest altitude after 300 s (km)": (key, f"reference_{key}")}
+    rows |= {"||error|| (success: below 0.02)": ("error_norm", "reference_error_norm")}
+    for label, (key, best) in rows.items():
+        target, *cells = table_row(table, label)
+        ours, best = metrics[key], metrics[best]
+        assert target == "-" and [float(c) for c in cells] == pytest.approx([best, ours, ours - best], abs=6e-4), label
+    assert float(table_row(table, "of the optimum's")[2]) == pytest.approx(metrics["mass_ratio"], abs=1e-6)
+    assert table_row(table, "success")[2] == "yes"
+    for key in (*PARTS, "episodic_return", "reference_episodic_return"):
+        assert f"{metrics[key]:.3f}" in table, key
+    assert f"{metrics['points']:.1f}" in table and "0.012300" in table.splitlines()[-1]
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Figures
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def lines_of(ax):
+    """The labelled lines of a panel, (n, 2) each."""
+    return {line.get_label(): line.get_xydata() for line in ax.lines if not line.get_label().startswith("_")}
+
+
+def test_ascent_figure_shows_both_flights(flown):
+    metrics, arrays = flown[CUTOFF]
+    figure = evaluate.draw_ascent(arrays, metrics)
+    panels = {ax.get_ylabel(): ax for ax in figure.axes}
+    assert len(panels) == len(figure.axes) == 14
+    altitude, other = ([(norm(row[:3]) - RE) / 1e3 for row in arrays[key]] for key in ("y", "y_reference"))
+    expected = {"(a) mass (t)": arrays["y"][:, 6] / 1e3, "(b) altitude (km)": altitude}
+    expected["(c) inertial speed (km/s)"] = [norm(row[3:6]) / 1e3 for row in arrays["y"]]
+    for k, (letter, axis) in enumerate(zip("def", "xyz")):
+        expected[f"({letter}) position ${axis}$ (km)"] = arrays["y"][:, k] / 1e3
+        expected[f"velocity $v_{axis}$ (km/s), pale"] = arrays["y"][:, 3 + k] / 1e3
+    for label, values in expected.items():
+        red = panels[label].lines[0]
+        assert red.get_xdata() == pytest.approx(arrays["t"]) and red.get_ydata() == pytest.approx(values), label
+        assert "pale" in label or red.get_color() == "tab:red"
+    blue = panels["(b) altitude (km)"].lines[1]
+    assert blue.get_color() == "tab:blue" and blue.get_ydata() == pytest.approx(other)
+    assert any(list(line.get_ydata()) == [250, 250] for line in panels["(b) altitude (km)"].lines)
+    for k, axis in enumerate("xyz"):
+        held = panels[f"thrust $u_{axis}$"].patches[0].get_data()
+        assert np.array_equal(held.values, arrays["u"][:, k]) and np.array_equal(held.edges, arrays["t"])
+    for label in ("(a) mass (t)", "thrust $u_x$", "pitch above the horizon (deg)"):
+        ends = [line.get_xdata()[0] for line in panels[label].lines if line.get_linestyle() == ":"]
+        assert ends == [75.2, 150.4, 261.0]
+    dropped = " ".join(text.get_text() for text in panels["(a) mass (t)"].texts)
+    assert all(text in dropped for text in ("13.68 t", "6.84 t", "8.83 t"))
+    title = figure.get_suptitle()
+    assert f"{metrics['error_norm']:.5f}" in title and f"{metrics['final_mass_kg']:.1f} kg" in title
+    assert all(ax.get_xlabel() for ax in figure.axes if "velocity" not in ax.get_ylabel())
+
+
+def test_pitch_and_yaw_are_the_programmes(flown):
+    _, arrays = flown[CUTOFF]
+    pitch, yaw = evaluate.pitch_and_yaw(arrays["u"], arrays["y"])
+    flown_pitch, flown_yaw = np.interp(arrays["t"][:-1], TIMES, BY_HAND), np.interp(arrays["t"][:-1], *WEAVE)
+    assert pitch == pytest.approx(flown_pitch, abs=1e-6)
+    vertical = flown_pitch > math.degrees(math.acos(0.1))
+    assert vertical.any() and np.array_equal(np.isnan(yaw), vertical)
+    assert yaw[~vertical] == pytest.approx(flown_yaw[~vertical], abs=1e-9)
+
+
+def test_orbit_figure_shows_orbits_insertion_and_ground_track(flown):
+    metrics, arrays = flown[CUTOFF]
+    figure = evaluate.draw_orbit(arrays, metrics)
+    plane, insertion, ground = figure.axes
+    lines, frame, y = lines_of(plane), target_frame(), arrays["y"]
+    target = lines["target orbit"]
+    assert target[:, 0].max() == pytest.approx(24.36114 * (1 - 0.7308)) and np.ptp(target[:, 0]) == pytest.approx(
+        48.72228
+    )
+    assert np.ptp(target[:, 1]) == pytest.approx(2 * 24.36114 * math.sqrt(1 - 0.7308**2), rel=1e-5)
+    assert lines["policy"] == pytest.approx((y[:, :3] @ frame[:2].T) / 1e6)
+    for r in evaluate.orbit_points(envs.ROCKET):  # the conic's equation: r = p - e x
+        assert norm(r) == pytest.approx(24361.14 * (1 - 0.7308**2) - 0.7308 * r @ frame[0])
+    distance = np.hypot(*(lines["orbit reached"] - lines["policy"][-1]).T)
+    assert distance.min() < 0.02  # 1000 km: it passes through the last state
+    angle = math.degrees(math.atan2(*lines["policy"][-1][::-1]))
+    circle = [line.get_xydata()[0] for line in insertion.lines if line.get_marker() == "o"][0]
+    assert circle == pytest.approx([angle, (norm(y[-1, :3]) - RE) / 1e3])
+    (west, east), (low, high) = insertion.get_xlim(), insertion.get_ylim()
+    assert west < angle < east and low < 0 and high > 250
+    longitude = [math.degrees(math.atan2(row[1], row[0]) - 7.29211585e-5 * t) for row, t in zip(y, arrays["t"])]
+    latitude = [math.degrees(math.asin(row[2] / norm(row[:3]))) for row in y]
+    red = next(line for line in ground.lines if line.get_color() == "tab:red")
+    assert red.get_xydata() == pytest.approx(np.c_[longitude, latitude])
+    assert red.get_xydata()[0] == pytest.approx([0, 28.5], abs=1e-9)
+    plane_at_launch = lines_of(ground)["target plane at launch"]
+    assert np.hypot(*(plane_at_launch - [0, 28.5]).T).min() < 0.5  # the launch site is in it, nearly
+    assert all(ax.get_xlabel() and ax.get_ylabel() and ax.get_title() for ax in figure.axes)
+
+
+def curve(level=0.0, evaluations=True):
+    """A synthetic training curve whose first loss dwarfs the others."""
+    update = np.arange(1, 41)
+    steps, values = 9600 * update, np.where(update == 1, 1e4, 1 + 0.1 * np.sin(update))
+    tags = {"charts/episodic_return": 20 - 60 * 0.9**update + level, "losses/policy_loss": np.sin(update) / 100}
+    drawn = {tag: (steps, column) for tag, column in (tags | {"losses/total_loss": values}).items()}
+    return drawn | ({"eval/error_norm": (steps[9::10], 0.5 * 0.5 ** update[:4])} if evaluations else {})
+
+
+def test_training_figure_shows_the_error_and_no_outlier(flown):
+    metrics, _ = flown[CUTOFF]
+    figure = evaluate.draw_training([curve(), curve(-1.0)], metrics)
+    returns, policy_loss, total_loss, error = figure.axes
+    assert error.get_yscale() == "log" and 0.02 in [line.get_ydata()[0] for line in error.lines]
+    assert "error" in error.get_ylabel()
+    low, high = total_loss.get_ylim()
+    assert 0.8 < low < 0.9 and 1.1 < high < 1.2 and "1e+04" in total_loss.get_title()
+    assert policy_loss.get_title() == "" and policy_loss.get_ylim()[1] > 0.0099
+    blue = [line for line in returns.lines if line.get_color() == "tab:blue"][0]
+    assert blue.get_ydata()[0] == metrics["reference_episodic_return"]
+    assert len(evaluate.draw_training([curve(evaluations=False)], metrics).axes) == 3
+
+
+def test_crash_can_be_drawn(crashed):
+    metrics, arrays = crashed
+    for figure in (evaluate.draw_ascent(arrays, metrics), evaluate.draw_orbit(arrays, metrics)):
+        assert "crashed" in figure.get_suptitle()
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Results folders
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def make_run(folder, flight, seed=1, level=0.0, **changes):
+    """A synthetic run folder: events, checkpoint, eval.json, eval.npz; returns it."""
+    from torch.utils.tensorboard import SummaryWriter
+
+    folder.mkdir(parents=True)
+    with SummaryWriter(folder) as writer:
+        for tag, (steps, values) in curve(level).items():
+            for step, value in zip(steps, values):
+                writer.add_scalar(tag, value, step)
+    (folder / "agent.safetensors").write_bytes(b"weights of seed %d" % seed)
+    digest = hashlib.sha256((folder / "agent.safetensors").read_bytes()).hexdigest()
+    metrics, arrays = flight
+    evaluate.write_json(folder / "eval.json", {**metrics, "seed": seed, "checkpoint_sha256": digest, **changes})
+    evaluate.write_npz(folder / "eval.npz", arrays)
+    return folder
+
+
+def test_publish_and_figures(flown, tmp_path, monkeypatch, capsys):
+    first = make_run(tmp_path / "a", flown[CUTOFF])
+    second = make_run(tmp_path / "b", flown[CUTOFF], seed=2, error_norm=0.5, final_mass_kg=6000.0, mass_ratio=0.8)
+    results = tmp_path / "results" / "rocket_cutoff"
+    printed = command_line(monkeypatch, capsys, "publish", first, results)
+    assert printed.startswith(CUTOFF) and "eccentricity" in printed and "seed 1" not in printed
+    files = snapshot(results)
+    names = {"agent.safetensors", "eval.json", "eval.npz", "seeds/1.json", "seeds/1.csv"}
+    names |= {f"figures/{name}.png" for name in ("training", "trajectory", "orbit")}
+    assert {str(name) for name in files} == names
+    for name, content in files.items():
+        if name.suffix == ".png":
+            assert content.startswith(b"\x89PNG") and len(content) > 40_000, "an empty picture is smaller"
+    command_line(monkeypatch, capsys, "publish", second, results)
+    monkeypatch.setattr(evaluate, "redraw", lambda folder: [folder / "figures" / "orbit.png"])  # drawn above
+    printed = command_line(monkeypatch, capsys, "figures", results)
+    error, mass = (flown[CUTOFF][0][key] for key in ("error_norm", "final_mass_kg"))
+    assert f"seed 1: ||error|| {error:.6f}, final mass {mass:.2f} kg" in printed
+    assert "seed 2: ||error|| 0.500000, final mass 6000.00 kg (0.8000 of the optimum's)" in printed
+    assert f"2 seeds: median ||error|| {(error + 0.5) / 2:.6f}, {error:.6f} to 0.500000" in printed
+    assert f"median final mass {(mass + 6000) / 2:.2f} kg, 6000.00 to {mass:.2f}" in printed
+
+
+def test_refused_publishing(flown, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(evaluate, "redraw", lambda folder: [])
+    results = tmp_path / "results"
+    command_line(monkeypatch, capsys, "publish", make_run(tmp_path / "good", flown[CUTOFF]), results)
+    before = snapshot(results)
+    metrics, arrays = flown[CUTOFF]
+    bad = {"y_reference": make_run(tmp_path / "lacks", (metrics, {k: arrays[k] for k in ARRAYS - {"y_reference"}}), 2)}
+    bad |= {FIXED: make_run(tmp_path / "other id", flown[FIXED], 2)}
+    bad |= {"env_id must be one of": make_run(tmp_path / "unknown", flown[CUTOFF], 2, env_id="RocketAscent-v9")}
+    for message, run in bad.items():
+        with pytest.raises(SystemExit) as refusal:
+            command_line(monkeypatch, capsys, "publish", run, results)
+        assert message in str(refusal.value) and "\n" not in str(refusal.value)
+        assert snapshot(results) == before
