@@ -4,9 +4,11 @@
     python baselines.py van-der-pol --json van_der_pol.json --npz van_der_pol.npz
     python baselines.py double-integrator-waypoints
     python baselines.py van-der-pol-waypoints
+    python baselines.py rocket --json results/rocket_reference.json --npz results/rocket_reference.npz
 
-Each prints mean costs over random starts and what they are compared with. Reading order: linear-quadratic optimum,
-nonlinear programs, references, command line. CasADi is imported only where a nonlinear program is built.
+Each prints mean costs over random starts and what they are compared with; the rocket has one start and five optima.
+Reading order: linear-quadratic optimum, nonlinear programs, references, the rocket's, command line. CasADi is imported
+only where a nonlinear program is built.
 """
 
 from __future__ import annotations
@@ -19,14 +21,19 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import cache
 from multiprocessing import get_context
 from pathlib import Path
+from typing import NamedTuple
+from zipfile import BadZipFile
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 from scipy.optimize import lsq_linear
 
-from envs import DOUBLE_INTEGRATOR, PROBLEMS, VAN_DER_POL, Problem, fly, rk4
+import envs
+from envs import DOUBLE_INTEGRATOR, PROBLEMS, ROCKET, VAN_DER_POL, Problem, Rocket, fly, rk4
 
 STARTS_PER_PROCESS = 100  # fewer are solved sooner than another process has started
 REPLAY_TOLERANCE = 1e-8  # relative difference between the cost of a program's solution and of its flight
@@ -276,6 +283,291 @@ def waypoint_reference(env_id: str, x0, processes: int | None = None) -> dict:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
+# Rocket ascent: one nonlinear program, transcribed by collocation or by the environment's own steps
+# ---------------------------------------------------------------------------------------------------------------------
+
+SEGMENTS = 80
+GAUSS_POINTS = (1 + np.polynomial.legendre.leggauss(4)[0]) / 2  # in (0, 1)
+TILT_TIME = 280.0  # s in which the guess tilts from straight up to the horizon
+FLOOR = 1.0  # m, the lowest altitude: without drag the optimum would fly through the ground
+
+
+class Ascent(NamedTuple):
+    """What is solved: a vehicle, its final time free (heaviest) or the table's (least turning), a ceiling in m."""
+
+    key: str
+    rocket: Rocket = ROCKET
+    free: bool = True
+    ceiling: float = np.inf
+
+
+ASCENTS = {
+    case.key: case
+    for case in (
+        Ascent("free"),
+        Ascent("free_table_isp", replace(ROCKET, table_isp=True)),
+        Ascent("fixed", free=False),
+        Ascent("fixed_capped", free=False, ceiling=250e3),
+        Ascent("drag_free", replace(ROCKET, Cd=0.0)),
+    )
+}
+
+
+class Mesh(NamedTuple):
+    """Where an ascent is cut into n intervals, at every event at least. Times in s, for the guessed final time."""
+
+    t: np.ndarray  # (n+1,) the intervals' ends
+    stretch: np.ndarray  # (n+1,) how t moves per second of final time
+    t_u: np.ndarray  # (m,) the times of the thrust directions
+    column: np.ndarray  # which of them the intervals use, in order
+    final_time: tuple[float, float]  # bounds
+    points: int  # collocation points within an interval
+
+
+def state_scale(rocket: Rocket):
+    """Earth radius and circular speed at it, (6,): in these units r and v are of order 1."""
+    return np.repeat([rocket.Re, np.sqrt(rocket.mu / rocket.Re)], 3)
+
+
+def collocation_mesh(case: Ascent, end: float, segments: int) -> Mesh:
+    """About `segments` intervals of like length, a whole number in each arc; the last arc's stretch with the end."""
+    arcs = [arc for arc in case.rocket.arcs() if arc[0] < end]
+    start, stop = arcs[-1][:2]
+    ends = [min(arc[1], end) for arc in arcs]
+    pieces = [np.linspace(a[0], b, max(round(segments * (b - a[0]) / end), 1) + 1)[1:] for a, b in zip(arcs, ends)]
+    t = np.concatenate([[0.0], *pieces])
+    t_u = (t[:-1, None] + np.diff(t)[:, None] * GAUSS_POINTS).ravel()
+    stretch = np.clip((t - start) / (end - start), 0.0, 1.0)
+    return Mesh(t, stretch, t_u, np.arange(len(t_u)), (start, stop), len(GAUSS_POINTS))
+
+
+def held_mesh(case: Ascent, end: float) -> Mesh:
+    """The environment's steps, cut at the events, each with one direction; only the last one's length can change."""
+    rocket = case.rocket
+    t_u = rocket.dt * np.arange(np.ceil(end / rocket.dt - 1e-9))
+    t = np.unique([*t_u, *(arc[1] for arc in rocket.arcs() if arc[1] < end), end])
+    final_time = (t[-2], t[-2] + rocket.dt) if case.free else (end, end)
+    column = np.searchsorted(t_u, t[:-1], side="right") - 1
+    return Mesh(t, (t == end).astype(float), t_u, column, final_time, 0)
+
+
+def collocation(rocket: Rocket):
+    """Interval of Gauss-Legendre collocation: CasADi function (x, z, u, (m, T, flow, dt)) -> (defects, x at the end).
+
+    The scaled r, v are the polynomial through x (6,) at the start and z (6, points) at the Gauss points; a defect is
+    its derivative there minus the dynamics' ("derivative form", e.g. Garg et al., Automatica 46, 2010).
+    """
+    import casadi as ca
+
+    tau = GAUSS_POINTS
+    C, D, _ = ca.collocation_coeff(tau)  # derivative at the points, value at the end
+    scale = ca.DM(state_scale(rocket))
+    x, z, u = ca.SX.sym("x", 6), ca.SX.sym("z", 6, len(tau)), ca.SX.sym("u", 3, len(tau))
+    mass, thrust, flow, dt = engine = ca.vertsplit(ca.SX.sym("engine", 4))
+    rates = []
+    for j in range(len(tau)):
+        state = (*ca.vertsplit(scale * z[:, j]), mass - flow * tau[j] * dt)
+        rates.append(ca.vertcat(*envs.ascent(state, (*ca.vertsplit(u[:, j]), thrust, flow), rocket)[:6]) / scale)
+    nodes = ca.horzcat(x, z)
+    defects = nodes @ C - dt * ca.horzcat(*rates)
+    return ca.Function("collocation", [x, z, u, ca.vertcat(*engine)], [defects, nodes @ D])
+
+
+def held_step(rocket: Rocket):
+    """Interval of multiple shooting, as `collocation` but without points: the environment's step, direction held."""
+    import casadi as ca
+
+    scale = ca.DM(state_scale(rocket))
+    x, u = ca.SX.sym("x", 6), ca.SX.sym("u", 3)
+    mass, thrust, flow, dt = engine = ca.vertsplit(ca.SX.sym("engine", 4))
+    state, control = (*ca.vertsplit(scale * x), mass), (*ca.vertsplit(u), thrust, flow)
+    x_next = rk4(lambda x, u: envs.ascent(x, u, rocket), state, control, dt)
+    none = ca.SX(6, 0)
+    return ca.Function("held_step", [x, none, u, ca.vertcat(*engine)], [none, ca.vertcat(*x_next[:6]) / scale])
+
+
+def burning(rocket: Rocket, t):
+    """Thrust (N) and flow (kg/s) from times t (n,) on, the start (s) of that arc and the mass (kg) there, each (n,)."""
+    start, end, thrust, flow, dropped = np.array(rocket.arcs()).T
+    mass = rocket.x0[6] - np.append(0.0, np.cumsum(flow * (end - start) + dropped)[:-1])
+    arc = np.searchsorted(end, t, side="right")
+    return thrust[arc], flow[arc], start[arc], mass[arc]
+
+
+def ascent_program(case: Ascent, mesh: Mesh):
+    """The nonlinear program as CasADi symbols: unknowns x (6, n) at the intervals' ends, z, u (3, m), final time.
+
+    Minimises the final time (the mass left falls with it), or sum |u_{k+1} - u_k|^2 where that is fixed. Constraints:
+    the defects, x continuous, |u| = 1, the target orbit by five independent numbers (= 0), |r| / Re at x (bounded).
+    """
+    import casadi as ca
+
+    ca.GlobalOptions.setNumpyMode(1)  # np.exp of a symbol is a symbol, without the warning that it was not always so
+    rocket, n = case.rocket, len(mesh.t) - 1
+    scale, end = state_scale(rocket), ca.MX.sym("end")
+    x, z, u = ca.MX.sym("x", 6, n), ca.MX.sym("z", 6, n * mesh.points), ca.MX.sym("u", 3, len(mesh.t_u))
+    t = ca.DM(mesh.t).T + (end - mesh.t[-1]) * ca.sparsify(ca.DM(mesh.stretch)).T
+    thrust, flow, start, mass = (ca.DM(column).T for column in burning(rocket, mesh.t[:-1]))
+    engine = ca.vertcat(mass - flow * (t[:-1] - start), thrust, flow, t[1:] - t[:-1])
+    x0 = rocket.x0[:6] / scale
+    x0[3] += 1e-16  # |v_rel| has no derivative where it is 0, as it is on the ground
+    interval = collocation(rocket) if mesh.points else held_step(rocket)
+    defects, ends = interval.map(n)(ca.horzcat(x0, x[:, :-1]), z, u[:, mesh.column.tolist()], engine)
+    h, e = (ca.vertcat(*vector) for vector in envs.orbit_vectors(ca.vertsplit(ca.DM(scale) * x[:, -1]), rocket.mu))
+    h_target, e_target = (ca.DM(vector) for vector in envs.target_orbit(rocket.target, rocket.mu))
+    # e is normal to h: once h is the target's, two components of e are left
+    orbit = ca.vertcat((h - h_target) / ca.norm_2(h_target), ca.DM(envs.target_axes(rocket)[:2]) @ (e - e_target))
+    constraints = ca.veccat(defects, x - ends, ca.sum1(u**2) - 1, orbit, ca.sqrt(ca.sum1(x[:3, :] ** 2)))
+    cost = end / (scale[0] / scale[3]) if case.free else ca.sumsqr(u[:, 1:] - u[:, :-1])
+    return {"x": ca.veccat(x, z, u, end), "f": cost, "g": constraints}
+
+
+def interpolate(times, t, values):
+    """Columns of `values` (k, d) at t (k,), linearly at `times` (m,): (m, d)."""
+    return np.column_stack([np.interp(times, t, column) for column in values.T])
+
+
+def ascend(case: Ascent, mesh: Mesh, guess: dict) -> dict:
+    """Solve `ascent_program` from a guess with t (s), y (its states, at least r and v), t_u (s), u (directions).
+
+    Returns the same of the optimum (y (n+1, 6)), `status`, `final_time`, `final_mass`, and `costate` (m, 3), the
+    multipliers of the velocity defects: in collocation the velocity's costate times the weight of the quadrature.
+    Raises RuntimeError where IPOPT finds no optimum.
+    """
+    import casadi as ca
+
+    rocket, n, points = case.rocket, len(mesh.t) - 1, mesh.points
+    program, scale = ascent_program(case, mesh), state_scale(rocket)
+    options = {"print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.tol": 1e-10}
+    solve = ca.nlpsol("ascent", "ipopt", program, options | {"ipopt.bound_relax_factor": 0})
+    times = np.append(mesh.t[1:], mesh.t_u if points else [])  # of x and z
+    states = interpolate(times, guess["t"], guess["y"][:, :6]) / scale
+    start = np.concatenate([states.ravel(), interpolate(mesh.t_u, guess["t_u"], guess["u"]).ravel(), mesh.t[-1:]])
+    box = np.full(len(start) - 1, 2.0)  # far from any ascent; it keeps IPOPT's first steps near the Earth
+    equal = np.zeros(program["g"].numel() - n)
+    low, high = (np.append(equal, np.full(n, 1 + h / rocket.Re)) for h in (FLOOR, case.ceiling))
+    lbx, ubx = np.append(-box, mesh.final_time[0]), np.append(box, mesh.final_time[1])
+    solution = solve(x0=start, lbx=lbx, ubx=ubx, lbg=low, ubg=high)
+    status = solve.stats()["return_status"]
+    if status != "Solve_Succeeded":
+        raise RuntimeError(f"rocket ascent {case.key}: IPOPT stopped with {status}")
+    w, end = solution["x"].full()[:-1, 0], float(solution["x"][-1])
+    y = np.vstack([rocket.x0[:6], w[: 6 * n].reshape(n, 6) * scale])
+    shift = end - mesh.t[-1]
+    t, t_u = mesh.t + shift * mesh.stretch, mesh.t_u + shift * np.interp(mesh.t_u, mesh.t, mesh.stretch)
+    _, flow, since, mass = burning(rocket, mesh.t[-2])
+    found = {"t": t, "y": y, "t_u": t_u, "u": w[6 * n * (1 + points) :].reshape(-1, 3), "status": status}
+    costate = solution["lam_g"].full()[: 6 * n * points].reshape(-1, 6)[:, 3:]
+    return found | {"final_time": end, "final_mass": mass - flow * (end - since), "costate": costate}
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Rocket ascent: references, flown by the environment
+# ---------------------------------------------------------------------------------------------------------------------
+
+FIXED, CUTOFF = "RocketAscent-v0", "RocketAscentCutoff-v0"
+ROCKET_REFERENCES = {CUTOFF: "free", FIXED: "fixed_capped"}
+RESULTS = Path(__file__).parent / "results"
+MISS_TOLERANCE = 2e-5  # terminal error of a reference in flight
+GUESSED_TIME = 900.0  # s
+PITCH_TIMES = (0.0, 30.0, 75.2, 150.4)  # s; the other five cut the last phase into quarters
+
+
+def fly_directions(env_id: str, rocket: Rocket, u, end: float) -> dict:
+    """`envs.fly_rocket` of the directions u (K, 3) in ECI, held over the steps until `end` (s)."""
+    options = {"rocket": rocket, "table_isp": rocket.table_isp}
+    return envs.fly_rocket(env_id, lambda obs, k: u[k, None], end_time=end, **options)
+
+
+def fly_pitch(env_id: str, pitch, end: float, **options) -> dict:
+    """`envs.fly_rocket` at the angles `pitch` (K,), rad, above the horizon, along the target's plane."""
+    act = lambda obs, k: [[np.sin(pitch[k]), np.cos(pitch[k]), 0.0]]  # noqa: E731
+    return envs.fly_rocket(env_id, act, end_time=end, action_frame="local", **options)
+
+
+def cold_start(case: Ascent, end: float) -> dict:
+    """The guess: a flight that tilts evenly from straight up to the horizon and stays there."""
+    t = case.rocket.dt * np.arange(np.ceil(end / case.rocket.dt))
+    pitch = np.pi / 2 * np.clip(1 - t / TILT_TIME, 0.0, 1.0)
+    flight = fly_pitch(FIXED, pitch, end, rocket=case.rocket, table_isp=case.rocket.table_isp)
+    return flight | {"t_u": flight["t"][:-1]}
+
+
+def collocate(case: Ascent, segments: int = SEGMENTS) -> dict:
+    """The optimum with free final time by direct collocation from a cold start: what `ascend` returns."""
+    return ascend(case, collocation_mesh(case, GUESSED_TIME, segments), cold_start(case, GUESSED_TIME))
+
+
+def nine_pitch_angles(env_id: str, flight: dict) -> dict:
+    """The opponent: a cubic spline through a flight's pitch at nine times (`PITCH_TIMES`), flown without feedback.
+
+    Returns what `envs.fly_rocket` does. The times are ours: close together where the pitch turns fast.
+    """
+    t, u = flight["t"], flight["u"].T
+    up, along, _ = envs.local_frame(flight["y"][:-1].T, envs.target_axes()[2])
+    pitch, middle = np.arctan2((u * up).sum(axis=0), (u * along).sum(axis=0)), (t[:-1] + t[1:]) / 2
+    knots = np.append(PITCH_TIMES, np.linspace(ROCKET.burns[2].end, t[-1], 5))
+    return fly_pitch(env_id, CubicSpline(knots, np.interp(knots, middle, pitch))(middle), t[-1])
+
+
+def solve_ascent(key: str):
+    """One of `ASCENTS`: its numbers, its flight by the environment, and the collocation (None if the time is fixed).
+
+    With free final time, mass, time and error are the collocation's. Its directions at mid-step, held over the steps,
+    miss the target by `held_error_norm`, and held ones cannot be as fast; so the heaviest ascent with held directions
+    is solved from there, and that one is flown. Raises RuntimeError where it misses by more than `MISS_TOLERANCE`.
+    """
+    case, begin, numbers, optimum = ASCENTS[key], time.perf_counter(), {}, None
+    rocket = case.rocket
+    if case.free:
+        guess = optimum = collocate(case)
+        mesh = held_mesh(case, optimum["final_time"])
+        middle = (mesh.t_u + np.append(mesh.t_u[1:], mesh.t[-1])) / 2
+        directions = CubicSpline(optimum["t_u"], optimum["u"])(middle)
+        held = fly_directions(FIXED, rocket, directions, optimum["final_time"])
+        numbers["held_error_norm"] = held["error_norm"]
+    else:
+        mesh, guess = held_mesh(case, rocket.end_time), cold_start(case, rocket.end_time)
+    steps = ascend(case, mesh, guess)
+    seconds, solution = time.perf_counter() - begin, optimum or steps
+    flight = fly_directions(FIXED, rocket, steps["u"], steps["final_time"])
+    if not flight["error_norm"] <= MISS_TOLERANCE:
+        raise RuntimeError(f"rocket ascent {key}: flown by the environment it misses by {flight['error_norm']}")
+    numbers |= {"final_mass_kg": solution["final_mass"], "final_time_s": solution["final_time"]}
+    numbers |= {"error_norm": np.linalg.norm(envs.terminal_error(solution["y"][-1], rocket))}
+    numbers |= {f"replay_{name}": flight[name] for name in ("error_norm", "final_mass_kg", "final_time_s")}
+    numbers |= {"turning": (np.diff(flight["u"], axis=0) ** 2).sum(), "max_altitude_km": flight["max_altitude_km"]}
+    numbers |= {"solve_seconds": seconds, "status": solution["status"]}
+    return {name: value if name == "status" else float(value) for name, value in numbers.items()}, flight, optimum
+
+
+def rocket_reference(env_id: str) -> dict:
+    """The reference of an environment id, flown by it: what `envs.fly_rocket` returns, and three numbers beside it.
+
+    `reference_mass_kg` and `reference_time_s` of the solve (see `ROCKET_REFERENCES`), `nine_pitch_error_norm` of
+    `nine_pitch_angles`. Read from results/rocket_reference.{json,npz}; solved anew, with CasADi, where these cannot be
+    read or do not reach the target any more. Raises ValueError on an unknown id, RuntimeError where a solve fails.
+    """
+    if env_id not in ROCKET_REFERENCES:
+        raise ValueError(f"env_id is {env_id!r}; it must be one of {', '.join(ROCKET_REFERENCES)}")
+    key = ROCKET_REFERENCES[env_id]
+    try:
+        numbers = json.loads((RESULTS / "rocket_reference.json").read_text())[key]
+        mass, end_time = float(numbers["final_mass_kg"]), float(numbers["final_time_s"])
+        with np.load(RESULTS / "rocket_reference.npz") as arrays:
+            flight = fly_directions(env_id, ROCKET, arrays[f"{key}_u"], arrays[f"{key}_t"][-1])
+        stale = not flight["error_norm"] <= MISS_TOLERANCE
+    except (OSError, EOFError, LookupError, TypeError, ValueError, BadZipFile):
+        stale = True
+    if stale:
+        numbers, flight, _ = solve_ascent(key)
+        mass, end_time = numbers["final_mass_kg"], numbers["final_time_s"]
+        flight = fly_directions(env_id, ROCKET, flight["u"], flight["t"][-1])
+    opponent = nine_pitch_angles(env_id, flight)["error_norm"]
+    return flight | {"reference_mass_kg": mass, "reference_time_s": end_time, "nine_pitch_error_norm": opponent}
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 # Command line
 # ---------------------------------------------------------------------------------------------------------------------
 
@@ -351,13 +643,54 @@ def report(args) -> None:
     numbers |= summarise(flight) | compare(env_id, x0, flight)
     for key, value in numbers.items():
         print(f"{key:<32}{value if isinstance(value, str) else format(value, '.7g')}")
+    arrays = {f"{key}_reference": flight[key] for key in ("x", "u", "cost")}
+    save(args, numbers, {"t": PROBLEMS[env_id].dt * np.arange(flight["x"].shape[1]), **arrays})
+
+
+def pontryagin_angle(optimum: dict):
+    """Angles (m,), degrees, between the thrust and the costate of the velocity, which the maximum principle wants 0."""
+    u, costate = optimum["u"], optimum["costate"]
+    return np.degrees(np.arctan2(np.linalg.norm(np.cross(u, costate), axis=1), (u * costate).sum(axis=1)))
+
+
+def check_rocket(numbers: dict, optimum: dict) -> dict:
+    """Checks of `free`, by its collocation `optimum`: the maximum principle, the mass that drag costs, other meshes."""
+    mass, angle = numbers["free"]["final_mass_kg"], pontryagin_angle(optimum)
+    checks = {"costate_angle_deg_max": angle.max(), "costate_angle_deg_median": np.median(angle)}
+    checks["drag_free_mass_gain_kg"] = numbers["drag_free"]["final_mass_kg"] - mass
+    for segments in (SEGMENTS // 2, 2 * SEGMENTS):
+        checks[f"mass_change_kg_{segments}_segments"] = collocate(ASCENTS["free"], segments)["final_mass"] - mass
+    return {key: float(value) for key, value in checks.items()}
+
+
+def report_rocket(args) -> None:
+    """Solve `ASCENTS`, print a row for each, the checks and the opponents, and write the files asked for."""
+    columns = ("final_mass_kg", "final_time_s", "error_norm", "replay_error_norm", "max_altitude_km", "solve_seconds")
+    print(f"{'':<16}" + "".join(f"{name:>19}" for name in columns) + "  status")
+    numbers, flights, optima = {}, {}, {}
+    for key in ASCENTS:
+        numbers[key], flights[key], optima[key] = solve_ascent(key)
+        cells = "".join(f"{numbers[key][name]:>19.10g}" for name in columns)
+        print(f"{key:<16}{cells}  {numbers[key]['status']}", flush=True)
+    checks = check_rocket(numbers, optima["free"])
+    for name, value in checks.items():
+        print(f"{name:<32}{value:.7g}")
+    for name, env_id in (("nine_pitch_angles", CUTOFF), ("nine_pitch_angles_fixed", FIXED)):
+        opponent = nine_pitch_angles(env_id, flights[ROCKET_REFERENCES[env_id]])
+        numbers[name] = {part: float(opponent[part]) for part in ("error_norm", "final_mass_kg", "final_time_s")}
+        print(f"{name:<32}" + "  ".join(f"{part} {value:.7g}" for part, value in numbers[name].items()))
+    arrays = {f"{key}_{name}": flight[name] for key, flight in flights.items() for name in ("t", "u")}
+    save(args, numbers | {"checks": checks}, arrays)
+
+
+def save(args, numbers: dict, arrays: dict) -> None:
+    """Write the files asked for."""
     if args.json:
         with replacing(args.json, "w") as file:
             json.dump(numbers, file, indent=2)
     if args.npz:
-        arrays = {f"{key}_reference": flight[key] for key in ("x", "u", "cost")}
         with replacing(args.npz) as file:
-            np.savez_compressed(file, t=PROBLEMS[env_id].dt * np.arange(flight["x"].shape[1]), **arrays)
+            np.savez_compressed(file, **arrays)
 
 
 @contextmanager
@@ -407,9 +740,11 @@ def parse_args(argv=None):
         command = commands.add_parser(name, help=f"optima of {env_id}")
         command.add_argument("--starts", type=integer(1, 100_000), default=1000, metavar="N", help="default 1000")
         command.add_argument("--seed", type=integer(0, 2**32 - 1), default=0, metavar="S", help="default 0")
+        command.set_defaults(run=report)
+    commands.add_parser("rocket", help="optima of the rocket ascent").set_defaults(run=report_rocket)
+    for command in commands.choices.values():
         command.add_argument("--json", type=output, metavar="F", help="write the numbers to this file")
         command.add_argument("--npz", type=output, metavar="F", help="write the trajectories to this file")
-        command.set_defaults(run=report)
     return parser.parse_args(argv)
 
 

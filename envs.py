@@ -446,12 +446,12 @@ class Rocket:
 
     @property
     def x0(self) -> np.ndarray:
-        """The start (7,): r (m) and v (m/s), inertial and Earth-centred, at rest on the ground, and the mass (kg)."""
+        """The start (7,): r (m) and v (m/s) in ECI, at rest on the ground, and the mass (kg) of all that is dropped, of
+        the last stage and of the payload."""
         latitude = np.radians(self.latitude)
         r = self.Re * np.array([np.cos(latitude), 0.0, np.sin(latitude)])
-        parts = {engine for burn in self.burns for _, engine in burn.engines}
-        number = {engine: max(sum(n for b in self.burns for n, e in b.dropped if e == engine), 1) for engine in parts}
-        mass = self.payload + sum(n * engine.total_mass for engine, n in number.items())
+        parts = [*(part for burn in self.burns for part in burn.dropped), *self.burns[-1].engines]
+        mass = self.payload + sum(n * engine.total_mass for n, engine in parts)
         return np.array([*r, 0.0, self.omega_e * r[0], 0.0, mass])
 
     @property
@@ -587,27 +587,28 @@ def orbital_reward(distance, next_distance):
 
 
 def trajectory_reward(energy, next_energy, phase, weight):
-    """R_trajectory = w (E_{t+1} - E_t) / (1 MJ/kg) in the first three phases, E the specific energy; by default w = 0."""
+    """R_trajectory = w (E_{t+1} - E_t) / (1 MJ/kg) in phases 0 to 2 of 0 to 3, E the specific energy; by default 0."""
     return weight * (next_energy - energy) / 1e6 * (phase < 3)
 
 
-def guidance_reward(u, frame, pitch, weight):
+def guidance_reward(u, up, along, pitch, weight):
     """R_guidance = -w (1 - u . d), d the direction at the reference pitch above the horizon, along the target's plane.
 
-    u (3, N); frame (3, 3, N) its rows up, along-track, cross-track; pitch (N,) in rad, NaN where there is no guidance.
+    u, up, along (3, N); pitch (N,) in rad at the step's start, NaN where there is no guidance.
     """
-    cosine = (u * (np.sin(pitch) * frame[0] + np.cos(pitch) * frame[1])).sum(axis=0)
+    cosine = (u * (np.sin(pitch) * up + np.cos(pitch) * along)).sum(axis=0)
     return np.where(np.isnan(pitch), 0.0, -weight * (1 - cosine))
 
 
 def penalties(altitude, time, turn, burnt, mass_weight):
-    """R_penalties = -40 1[h < 0] - 0.024 o - 0.024 s - 0.001 |u_t - u_{t-1}| - w_m (kg burnt after 261 s) / 100 kg.
+    """R_penalties = -40 1[h < 0] - 0.024 o - 0.024 s - 0.001 |u_t - u_{t-1}| - w_m (kg burnt in phase 4) / 100 kg.
 
     o = clip((h - 245 km) / 100 km, 0, 1), overshoot; s = clip((110 km - h) / 30 km, 0, 1) after 300 s, a dip into the
-    air at orbital speed. A crash must cost more than the worst miss. Altitude in m and time in s at the step's end.
+    air at orbital speed. A crash must cost more than the worst miss. Altitude in m and time in s at the step's end;
+    burnt counts in steps that begin in phase 4.
     """
-    overshoot = np.clip((altitude - 245e3) / 100e3, 0.0, 1.0)
-    sag = np.clip((110e3 - altitude) / 30e3, 0.0, 1.0) * (time > 300.0)
+    overshoot = np.minimum(np.maximum((altitude - 245e3) / 100e3, 0.0), 1.0)
+    sag = np.minimum(np.maximum((110e3 - altitude) / 30e3, 0.0), 1.0) * (time > 300.0)
     return -40.0 * (altitude < 0) - 0.024 * (overshoot + sag) - 0.001 * turn - mass_weight * burnt / 100.0
 
 
@@ -635,13 +636,16 @@ STIFF = 0.25  # drag's rate |D| / (m |v_rel|) times the step, from which a step 
 
 
 def local_frame(y, normal):
-    """Unit vectors up, along-track, cross-track of the plane with this normal (3,) at states y (7, N): (3, 3, N)."""
+    """Unit vectors up, along-track (normal x up), cross-track (up x along) at states y (7, N): (3, N) each.
+
+    Written out: a matrix product would round a row differently in a larger batch.
+    """
     up = y[:3] / np.sqrt((y[:3] ** 2).sum(axis=0))
     (rx, ry, rz), (nx, ny, nz) = up, normal
-    along = np.stack([ny * rz - nz * ry, nz * rx - nx * rz, nx * ry - ny * rx])
-    along /= np.sqrt((along * along).sum(axis=0))
-    ax, ay, az = along
-    return np.stack([up, along, np.stack([ry * az - rz * ay, rz * ax - rx * az, rx * ay - ry * ax])])
+    along = np.array([ny * rz - nz * ry, nz * rx - nx * rz, nx * ry - ny * rx])
+    length = np.sqrt((along * along).sum(axis=0))
+    cross = normal[:, None] - (nx * rx + ny * ry + nz * rz) * up
+    return up, along / length, cross / length
 
 
 class RocketVectorEnv(BatchedEnv):
@@ -656,12 +660,12 @@ class RocketVectorEnv(BatchedEnv):
     the step, to 1e-10, ends the episode. An altitude below 0 ends it too (crash), and so does `end_time`.
 
     Reward: the sum of the five parts R_orbital, R_trajectory, R_guidance, R_penalties and R_terminal, each a function
-    above. `final_info`, (N,) each but `error` (N, 6), the terminal error in ECI: `error_norm`; `a_km e i_deg raan_deg argp_deg
-    final_mass_kg final_time_s max_altitude_km` (at the steps' ends); the parts' sums, `episodic_return`, the paper's
-    `points`, `crashed`.
+    above. `final_info`, (N,) each: `error_norm` (and `error` (N, 6), the terminal error in ECI), `a_km e i_deg raan_deg
+    argp_deg final_mass_kg final_time_s max_altitude_km` (at the steps' ends), the parts' sums, `episodic_return`, the
+    paper's `points`, `crashed`.
 
-    Attributes that only training changes: `mass_weight`, `trajectory_weight`, `guidance_weight`, `guidance` (a key of
-    `REFERENCE_PITCH`) and `end_time` (s, at most the last phase's end), of which the next `reset` takes notice.
+    Attributes that only training changes, to be set before a `reset`: `mass_weight`, `trajectory_weight`,
+    `guidance_weight`, `guidance` (a key of `REFERENCE_PITCH`) and `end_time` (s, at most the last phase's end).
     """
 
     PARTS = ("R_orbital", "R_trajectory", "R_guidance", "R_penalties", "R_terminal")
@@ -677,7 +681,8 @@ class RocketVectorEnv(BatchedEnv):
     ):
         if action_frame not in ACTION_FRAMES:
             raise ValueError(f"action_frame is {action_frame!r}; it must be one of {', '.join(ACTION_FRAMES)}")
-        self.rocket = replace(rocket, table_isp=table_isp)
+        self.rocket = replace(rocket, table_isp=table_isp or rocket.table_isp)
+        self._last_phase = len(rocket.burns) - 1
         self.cutoff, self.action_frame, self.observe_phase = cutoff, action_frame, observe_phase
         self.mass_weight, self.trajectory_weight, self.guidance_weight, self.guidance = 0.0, 0.0, 0.1, "none"
         x0 = self.rocket.x0
@@ -689,8 +694,8 @@ class RocketVectorEnv(BatchedEnv):
         self.end_time = self.rocket.end_time  # sets episode_steps, too
         self._axes = target_axes(self.rocket)
         h, e = target_orbit(self.rocket.target, self.rocket.mu)
-        self._h_scale = np.linalg.norm(h)
-        self._target = np.concatenate([self._axes @ h / self._h_scale, self._axes @ e])[:, None]
+        self._h_axes = self._axes / np.linalg.norm(h)
+        self._target = np.concatenate([self._h_axes @ h, self._axes @ e])[:, None]
         self.y = np.repeat(x0[:, None], num_envs, axis=1)  # (7, N)
         self.u = np.zeros((3, num_envs))  # the direction of the step before, in ECI
         self._parts = np.zeros((len(self.PARTS), num_envs))
@@ -706,7 +711,7 @@ class RocketVectorEnv(BatchedEnv):
     def end_time(self, value: float):
         if not 0 < value <= self.rocket.end_time:
             raise ValueError(f"end_time is {value} s; it must be positive and at most {self.rocket.end_time}")
-        self.episode_steps = int(np.ceil(value / self.rocket.dt - 1e-9))
+        self.episode_steps = max(int(np.ceil(value / self.rocket.dt - 1e-9)), 1)
         self._grid = np.append(self.rocket.dt * np.arange(self.episode_steps), float(value))
         self._tabulate()
 
@@ -728,6 +733,8 @@ class RocketVectorEnv(BatchedEnv):
     def _start(self, mask, options):
         if options:
             raise ValueError(f"reset options are {options!r}; a rocket has one start and no options")
+        if self.guidance not in REFERENCE_PITCH:
+            raise ValueError(f"guidance is {self.guidance!r}; it must be one of {', '.join(REFERENCE_PITCH)}")
         self.y[:, mask] = self.rocket.x0[:, None]
         self._parts[:, mask] = self.u[:, mask] = 0.0
         self._max_altitude[mask] = self.time[mask] = 0.0
@@ -737,7 +744,7 @@ class RocketVectorEnv(BatchedEnv):
     def _progress(self):
         """The distance L to the target orbit (see `orbital_reward`) and the specific energy, both (N,)."""
         h, e = orbit_vectors(self.y, self.rocket.mu)
-        error = np.concatenate([self._axes @ h / self._h_scale, self._axes @ e]) - self._target
+        error = np.concatenate([self._h_axes @ h, self._axes @ e]) - self._target
         return np.abs(error).sum(axis=0), specific_energy(self.y, self.rocket.mu)
 
     def _observe(self):
@@ -751,7 +758,10 @@ class RocketVectorEnv(BatchedEnv):
             raise ValueError(f"action of env {bad} at step {self.t[bad]} is [0, 0, 0]; a direction must have a length")
         u = actions.T / largest  # before squaring: neither overflow nor underflow
         u /= np.sqrt((u * u).sum(axis=0))
-        return (local_frame(self.y, self._axes[2]) * u[:, None]).sum(axis=0) if self.action_frame == "local" else u
+        if self.action_frame == "eci":
+            return u
+        up, along, cross = local_frame(self.y, self._axes[2])
+        return up * u[0] + along * u[1] + cross * u[2]
 
     def _advance(self, actions):
         t, u, before = self.t, self._directions(actions), self.y
@@ -759,9 +769,8 @@ class RocketVectorEnv(BatchedEnv):
         self.y = self._fly(before, u, t, duration)
         done = t + 1 == self.episode_steps
         if self.cutoff:
-            reached = (self._phase[t] == self._phase[-1]) & (
-                specific_energy(self.y, self.rocket.mu) >= self.rocket.target_energy
-            )
+            energy = specific_energy(self.y, self.rocket.mu)
+            reached = (self._phase[t] == self._last_phase) & (energy >= self.rocket.target_energy)
             if reached.any():
                 self.y[:, reached], duration[reached] = self._cut(before, u, t, duration, reached)
             done = done | reached
@@ -792,39 +801,39 @@ class RocketVectorEnv(BatchedEnv):
         `STIFF`. No ascent comes near it; without this a crash at orbital speed would end in numbers without meaning.
         """
         rocket, controls = self.rocket, (*u, thrust, flow)
-        f = lambda x, u: ascent(x, u, rocket)  # noqa: E731
+        # the state as one component (7, n): rk4 then takes a seventh of the array operations
+        f = lambda x, u: (np.array(ascent(x[0], u, rocket)),)  # noqa: E731
         speed = np.sqrt((y[3:6] ** 2).sum(axis=0))
         lowest = np.maximum(np.sqrt((y[:3] ** 2).sum(axis=0)) - rocket.Re - speed * dt, 0.0)
         rate = rocket.rho0 * np.exp(-lowest / rocket.H) * rocket.Cd * rocket.S * speed / y[6]
-        y_next = np.stack(rk4(f, y, controls, dt))
+        (y_next,) = rk4(f, (y,), controls, dt)
         stiff = np.flatnonzero(rate * dt > STIFF)
         if len(stiff):
-            n = int(np.ceil((rate * dt)[stiff].max() / STIFF))
+            n = np.ceil((rate * dt)[stiff] / STIFF)  # for each its own: it must not depend on the rest of the batch
             y_sub, controls, dt = y[:, stiff], tuple(c[stiff] for c in controls), dt[stiff] / n
-            for _ in range(n):
+            for k in range(int(n.max())):
                 aloft = (y_sub[:3] ** 2).sum(axis=0) >= rocket.Re**2  # who is below the ground stays there
-                y_sub = np.where(aloft, np.stack(rk4(f, y_sub, controls, dt)), y_sub)
+                y_sub = np.where(aloft & (k < n), rk4(f, (y_sub,), controls, dt)[0], y_sub)
             y_next[:, stiff] = y_sub
         return y_next
 
     def _cut(self, before, u, t, duration, reached):
         """States (7, n) and times (n,) within the step at which those who `reached` the target's energy have just it.
 
-        Regula falsi with the Illinois change (Dowell and Jarratt, 1971): the energy grows almost linearly in a step.
+        Regula falsi with the Illinois change (Dowell and Jarratt, 1971). The energy grows almost linearly in a step, so
+        that four evaluations reach rounding; six, for all alike, keep a row independent of the rest of the batch.
         """
         before, u, t, goal = before[:, reached], u[:, reached], t[reached], self.rocket.target_energy
-        low, high = np.zeros(len(t)), duration[reached]
-        excess = lambda y: specific_energy(y, self.rocket.mu) - goal  # noqa: E731
-        f_low, f_high = excess(before), excess(self.y[:, reached])
-        y, time = self.y[:, reached], high
-        for _ in range(50):
+        low, high, above = np.zeros(len(t)), duration[reached], np.full(len(t), -1)
+        f_low = np.minimum(specific_energy(before, self.rocket.mu) - goal, -1e-300)  # beyond it at the start: cut there
+        f_high = specific_energy(self.y[:, reached], self.rocket.mu) - goal
+        for _ in range(6):
             time = low - f_low * (high - low) / (f_high - f_low)
             y = self._fly(before, u, t, time)
-            f = excess(y)
-            if (np.abs(f) <= 1e-11 * abs(goal)).all():
-                break
+            f, above_before = specific_energy(y, self.rocket.mu) - goal, above
             above = f >= 0
-            f_low, f_high = np.where(above, f_low / 2, f), np.where(above, f, f_high / 2)
+            kept = above == above_before  # the same end twice: its value is halved
+            f_low, f_high = np.where(above, f_low / (1 + kept), f), np.where(above, f, f_high / (1 + kept))
             low, high = np.where(above, low, time), np.where(above, time, high)
         return y, time
 
@@ -833,13 +842,13 @@ class RocketVectorEnv(BatchedEnv):
         t, phase = self.t, self._phase[self.t]
         distance, energy = self._progress()
         turn = np.sqrt(((u - self.u) ** 2).sum(axis=0)) * (t > 0)
-        burnt = (before[6] - self.y[6]) * (phase == self._phase[-1])
+        burnt = (before[6] - self.y[6]) * (phase == self._last_phase)
         parts = np.zeros_like(self._parts)
         parts[0] = orbital_reward(self._distance, distance)
         parts[1] = trajectory_reward(self._energy, energy, phase, self.trajectory_weight)
         if REFERENCE_PITCH[self.guidance] is not None:
             pitch = np.radians(np.interp(self._grid[t], *REFERENCE_PITCH[self.guidance], right=np.nan))
-            parts[2] = guidance_reward(u, local_frame(before, self._axes[2]), pitch, self.guidance_weight)
+            parts[2] = guidance_reward(u, *local_frame(before, self._axes[2])[:2], pitch, self.guidance_weight)
         parts[3] = penalties(altitude, self.time, turn, burnt, self.mass_weight)
         parts[4, done] = terminal_reward(distance[done])
         self._parts += parts

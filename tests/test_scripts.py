@@ -25,10 +25,11 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 torch.set_num_threads(1)
 ROOT = Path(__file__).parent.parent
 SCRIPTS = sorted(ROOT.glob("ppo_gtrxl_*.py"))
-DI, VDP = (importlib.import_module(f"ppo_gtrxl_{name}") for name in ("di", "vdp"))
+DI, VDP, ROCKET = (importlib.import_module(f"ppo_gtrxl_{name}") for name in ("di", "vdp", "rocket"))
 STEPS = {"DoubleIntegrator-v0": 50, "DoubleIntegratorWaypoints-v0": 100}  # of an episode
 STEPS |= {"VanDerPol-v0": 70, "VanDerPolWaypoints-v0": 140}
-CASES = [(DI if env_id.startswith("Double") else VDP, env_id) for env_id in STEPS]
+STEPS |= {"RocketAscent-v0": 481, "RocketAscentCutoff-v0": 481}
+CASES = [(script, env_id) for script in (DI, VDP, ROCKET) for env_id in script.ENV_IDS]
 NETWORK = ["--embed-dim=8", "--num-heads=2", "--num-blocks=1", "--memory-length=4", "--mlp-dim=8", "--hidden-dim=8"]
 TINY = [*NETWORK, "--num-envs=2", "--num-minibatches=2", "--update-epochs=2", "--eval-starts=10"]
 
@@ -156,9 +157,12 @@ def test_flags_of_the_interface():
     words += " vf_coef max_grad_norm target_kl total_updates num_blocks embed_dim num_heads memory_length mlp_dim"
     words += " hidden_dim learning_rate_final ent_coef_final reward_scale radius_curriculum weight_average log_std"
     words += " checkpoint resume eval_only eval_starts eval_seed eval_json eval_npz eval_every observe_phase"
-    words += " num_threads"
-    for script in (DI, VDP):
-        assert set(words.split()) <= {field.name for field in dataclasses.fields(script.Args)}
+    words += " num_threads return_norm noise log_std_final"
+    fields = {s: {field.name for field in dataclasses.fields(s.Args)} for s in (DI, VDP, ROCKET)}
+    assert all(set(words.split()) <= fields[script] | {"radius_curriculum"} for script in fields)
+    assert fields[DI] == fields[VDP] == fields[ROCKET] - {"action_frame", "guidance", "mass_weight"} | {
+        "radius_curriculum"
+    }
 
 
 # --- a run's files ----------------------------------------------------------------------------------------------------
@@ -167,7 +171,11 @@ CHARTS = {f"charts/{name}" for name in ("episodic_return", "episodic_length", "l
 LOSSES = "value_loss policy_loss entropy old_approx_kl approx_kl clipfrac explained_variance total_loss"
 RUN_FILES = {"args.json", "training_state.pt", "agent.safetensors", "eval.json", "eval.npz"}
 COMMON_KEYS = "env_id seed eval_seed eval_starts checkpoint_sha256 total_updates global_step wall_seconds device"
-COMMON_KEYS += " torch_version episodic_return reference_episodic_return cost_mean reference_cost_mean hit_rate"
+COMMON_KEYS += " torch_version episodic_return reference_episodic_return"
+PHASED_KEYS = "cost_mean reference_cost_mean hit_rate"
+ROCKET_KEYS = """error_norm a_km e i_deg raan_deg argp_deg perigee_km apogee_km a_error_km e_error i_error_deg
+    raan_error_deg argp_error_deg final_mass_kg final_time_s mass_ratio reference_mass_kg reference_time_s
+    max_altitude_km success"""
 
 
 @pytest.fixture(scope="module", params=CASES, ids=lambda case: case[1])
@@ -201,11 +209,13 @@ def test_smoke_run_writes_what_the_interface_names(smoke):
     assert len(events) == 1 and names - events == RUN_FILES
     assert os.listdir(folder) == ["runs"]
     metrics = json.loads((run / "eval.json").read_text())
-    assert set(COMMON_KEYS.split()) <= metrics.keys()
-    assert (metrics["env_id"], metrics["seed"], metrics["eval_seed"], metrics["eval_starts"]) == (env_id, 1, 0, 50)
+    rocket = script is ROCKET
+    assert set(COMMON_KEYS.split()) | set((ROCKET_KEYS if rocket else PHASED_KEYS).split()) <= metrics.keys()
+    assert (metrics["env_id"], metrics["seed"], metrics["eval_seed"]) == (env_id, 1, 0)
+    assert metrics["eval_starts"] == (1 if rocket else 50)  # a rocket has one start
     assert (metrics["total_updates"], metrics["global_step"]) == (2, 2 * 4 * STEPS[env_id])
     assert metrics["checkpoint_sha256"] == hashlib.sha256((run / "agent.safetensors").read_bytes()).hexdigest()
-    assert "optimum" in output and "ours" in output and "ratio" in output
+    assert "optimum" in output and "ours" in output and ("difference" if rocket else "ratio") in output
 
 
 def test_smoke_run_logs_the_tags(smoke):
@@ -220,7 +230,8 @@ def test_smoke_run_logs_the_tags(smoke):
         ((step, shown),) = logged[tag]
         assert step == updates[-1] and shown == pytest.approx(value, rel=1e-6), tag
     rates = [value for _, value in logged["charts/learning_rate"]]
-    assert rates == pytest.approx([script.Args().learning_rate, script.Args().learning_rate_final], rel=1e-6)
+    first, last = script.Args().learning_rate, script.Args().learning_rate_final
+    assert rates == pytest.approx([first, last], rel=1e-6) if script is not ROCKET else last <= rates[1] <= rates[0]
     assert [value for _, value in logged["charts/episodic_length"]] == [STEPS[env_id]] * 2
 
 
@@ -254,7 +265,7 @@ def test_eval_only_repeats_the_runs_evaluation(smoke, tmp_path, monkeypatch, cap
     with np.load("a.npz") as again, np.load(run / "eval.npz") as first:
         assert again.keys() == first.keys()
         assert all(np.array_equal(again[key], first[key]) for key in first)
-    table = output[output.index(f"{env_id}: 50 starts") :]
+    table = output[output.index(f"{env_id}: ") :]
     assert table in capsys.readouterr().out
 
 
@@ -338,6 +349,91 @@ def test_run_averages_with_its_decay(tmp_path, monkeypatch, decay):
         for current in weights[1:]:
             average = decay * average + (1 - decay) * current[name]
         torch.testing.assert_close(tensor, average, rtol=1e-5, atol=1e-7)
+
+
+# --- the rocket -------------------------------------------------------------------------------------------------------
+
+TABLE_1_ROCKET = """--num-blocks 6 --embed-dim 384 --num-heads 8 --memory-length 256 --mlp-dim 384 --hidden-dim 384
+    --gamma 0.99 --gae-lambda 0.95 --total-updates 5000 --update-epochs 16 --vf-coef 0.8 --learning-rate 1e-4
+    --learning-rate-final 5e-6 --lr-schedule linear --target-kl None --ent-coef 1e-3 --ent-coef-final 1e-4
+    --clip-coef 0.12 --return-norm none --noise learned --weight-average 0"""
+
+
+def test_readme_gives_the_papers_rocket():
+    """Table 1's column, as one command."""
+    words = (ROOT / "README.md").read_text().replace("\\\n", " ").split()
+    command = TABLE_1_ROCKET.split()
+    assert any(words[k : k + len(command)] == command for k in range(len(words)))
+
+
+def test_the_papers_rocket_network_trains(tmp_path):
+    """One update of exactly that network, with two episodes and one epoch; its memory is printed."""
+    more = ["--total-updates", "1", "--num-envs", "2", "--update-epochs", "1", "--eval-every", "0"]
+    command = [sys.executable, ROCKET.__file__, *TABLE_1_ROCKET.split(), *more]
+    peak = "import resource, runpy, sys; sys.argv = sys.argv[1:]; runpy.run_path(sys.argv[0], run_name='__main__');"
+    peak += "print('peak MB', resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024)"
+    environment = {**os.environ, "OMP_NUM_THREADS": "2", "PYTHONPATH": str(ROOT)}
+    command[1:1] = ["-c", peak]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    print(done.stdout.splitlines()[-1])
+    assert int(done.stdout.split()[-1]) < 4000
+    (run,) = (tmp_path / "runs").iterdir()
+    weights = safetensors.torch.load_file(run / "agent.safetensors")
+    assert weights["blocks.5.attention.R"].shape == (8, 257, 48)
+
+
+def rocket_run(folder, *argv):
+    """A tiny rocket run in `folder`: its run folder."""
+    here = os.getcwd()
+    os.chdir(folder)
+    try:
+        ROCKET.main([*TINY, "--total-updates=1", "--update-epochs=1", "--eval-every=0", *argv])
+    finally:
+        os.chdir(here)
+    return max((Path(folder) / "runs").iterdir(), key=lambda path: path.stat().st_mtime)
+
+
+@pytest.fixture(scope="module")
+def rocket(tmp_path_factory):
+    return rocket_run(tmp_path_factory.mktemp("rocket"), "--action-frame=eci", "--capture-video")
+
+
+def test_rocket_draws_its_figures(rocket):
+    assert {path.name for path in (rocket / "figures").iterdir()} == {"training.png", "trajectory.png", "orbit.png"}
+
+
+def test_action_frame_comes_from_the_checkpoint(rocket, tmp_path, monkeypatch, refuses):
+    checkpoint = rocket / "agent.safetensors"
+    monkeypatch.chdir(tmp_path)
+    ROCKET.main(["--eval-only", f"--checkpoint={checkpoint}", "--eval-json=a.json"])
+    again, first = json.loads(Path("a.json").read_text()), json.loads((rocket / "eval.json").read_text())
+    assert again == first
+    message = refuses("--eval-only", "--checkpoint", checkpoint, "--action-frame=local", script=ROCKET)
+    assert message.startswith("error: --action-frame local: the checkpoint has eci")
+
+
+def test_checkpoint_of_the_other_variant(rocket, tmp_path, capsys):
+    """Allowed to begin from, with a line that says so; `--resume` takes no other id at all."""
+    run = rocket_run(tmp_path, "--env-id=RocketAscentCutoff-v0", f"--checkpoint={rocket / 'agent.safetensors'}")
+    assert "--checkpoint is of RocketAscent-v0; it goes on with RocketAscentCutoff-v0" in capsys.readouterr().out
+    assert json.loads((run / "eval.json").read_text())["env_id"] == "RocketAscentCutoff-v0"
+    assert json.loads((run / "args.json").read_text())["action_frame"] == "eci"
+
+
+def test_resume_with_the_other_variant(rocket, refuses):
+    message = refuses("--resume", rocket, "--env-id=RocketAscentCutoff-v0", script=ROCKET)
+    assert "only --cuda and --num-threads" in message
+
+
+@pytest.mark.parametrize("argv", ["--action-frame=ecef", "--guidance=pitch", "--noise=loud", "--return-norm=all"])
+def test_unknown_choice(refuses, argv):
+    name, value = argv.split("=")
+    assert re.match(rf"error: {name} {value}: must be one of \w+, ", refuses(argv, script=ROCKET))
+
+
+def test_learning_rate_cannot_follow_a_limit_that_is_not_there(refuses):
+    assert "--lr-schedule kl: needs --target-kl" in refuses("--target-kl", None, script=ROCKET)
 
 
 # --- seeds and resume -------------------------------------------------------------------------------------------------
@@ -559,7 +655,7 @@ def flag(name):
 
 NUMBERS = [f for f in dataclasses.fields(DI.Args) if re.search(r"\b(int|float)\b", str(f.type))]
 POSITIVE = "total_updates num_envs num_minibatches update_epochs num_blocks embed_dim num_heads mlp_dim hidden_dim"
-POSITIVE += " eval_starts reward_scale max_grad_norm target_kl radius_curriculum"
+POSITIVE += " eval_starts reward_scale max_grad_norm target_kl target_kl_final noise_decay radius_curriculum"
 
 
 @pytest.mark.parametrize("field", NUMBERS, ids=lambda field: field.name)
