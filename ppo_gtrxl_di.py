@@ -104,9 +104,9 @@ BUFFERS = {env_id: {"observation_scale": [1.0] * n} for env_id, n in zip(ENV_IDS
 INITIAL_ACTION = [0.0]
 
 
-def features(obs, observation_scale):
-    """What the encoder sees of observations (..., obs)."""
-    return obs / observation_scale
+def features(agent, obs):
+    """What the encoder sees of observations (..., obs); the agent holds `BUFFERS`, as its checkpoint does."""
+    return obs / agent.observation_scale
 
 
 def set_curriculum(envs, args, progress):
@@ -225,11 +225,9 @@ class Agent(nn.Module):
         super().__init__()
         d, hidden, actions = args.embed_dim, args.hidden_dim, envs.single_action_space.shape[0]
         self.num_blocks, self.memory_length, self.embed_dim = args.num_blocks, args.memory_length, d
-        self.constants = list(BUFFERS[args.env_id])
-        for name, value in BUFFERS[args.env_id].items():
+        for name, value in {**BUFFERS[args.env_id], "action_scale": envs.single_action_space.high.tolist()}.items():
             self.register_buffer(name, torch.tensor(value))
-        self.register_buffer("action_scale", torch.tensor(envs.single_action_space.high, dtype=torch.float32))
-        inputs = len(self.features(torch.ones(envs.single_observation_space.shape)))
+        inputs = len(features(self, torch.ones(envs.single_observation_space.shape)))
         self.encoder = nn.Sequential(linear(inputs, d, gain=2**0.5), nn.GELU())
         sizes = d, args.num_heads, args.memory_length, args.mlp_dim
         self.blocks = nn.ModuleList(GTrXLBlock(*sizes) for _ in range(args.num_blocks))
@@ -238,10 +236,6 @@ class Agent(nn.Module):
         self.critic = nn.Sequential(linear(d, hidden, gain=2**0.5), nn.GELU(), linear(hidden, 1))
         self.actor_logstd = nn.Parameter(torch.full((actions,), args.log_std), requires_grad=args.noise == "learned")
 
-    def features(self, obs):
-        """The problem's `features`, with its constants out of the checkpoint."""
-        return features(obs, *(getattr(self, name) for name in self.constants))
-
     def new_memory(self, num_envs, noise):
         """m_0 ~ N(0, noise^2), drawn once per episode and block: (blocks, N, L, d)."""
         zeros = self.actor_logstd.new_zeros(self.num_blocks, num_envs, self.memory_length, self.embed_dim)
@@ -249,7 +243,7 @@ class Agent(nn.Module):
 
     def encode(self, obs, memory):
         """Whole episodes in parallel (training): obs (N, T, obs), memory (blocks, N, L, d) -> hidden (N, T, d)."""
-        x = self.encoder(self.features(obs))
+        x = self.encoder(features(self, obs))
         for block, block_memory in zip(self.blocks, memory):
             x = block(x, block.attention(x, block_memory))
         return x
@@ -261,7 +255,7 @@ class Agent(nn.Module):
 
     def encode_step(self, obs, cache, t):
         """Step t of the same episodes (rollout): obs (N, obs) -> hidden (N, d); its cost does not grow with t."""
-        x = self.encoder(self.features(obs))
+        x = self.encoder(features(self, obs))
         for block, block_cache in zip(self.blocks, cache):
             x = block(x, block.attention.step(x, block_cache, t))
         return x
@@ -293,29 +287,6 @@ class Batch:
     memory: torch.Tensor  # (blocks, N, L, d)
     advantages: torch.Tensor | None = None  # (T, N), filled by update, as the returns
     returns: torch.Tensor | None = None  # (T, N), the critic's target
-
-
-class ReturnNorm(nn.Module):
-    """V(s, t) = mean_t + std_t critic(s): the mean and spread over episodes of the return from each step on.
-
-    All episodes share the clock, and what differs between them is small beside what the steps to go bring.
-    """
-
-    def __init__(self, steps):
-        super().__init__()
-        self.register_buffer("mean", torch.zeros(steps, 1))
-        self.register_buffer("std", torch.ones(steps, 1))
-        self.register_buffer("spread", torch.zeros(steps, 1))  # before the floor that `std` has
-
-    def observe(self, returns, alive):
-        """Move towards the statistics of the returns (T, N) of one update's episodes; a step no one lived to stays."""
-        count = alive.sum(dim=1, keepdim=True)
-        mean = (returns * alive).sum(dim=1, keepdim=True) / count.clamp(min=1)
-        spread = (((returns - mean) ** 2 * alive).sum(dim=1, keepdim=True) / count.clamp(min=1)).sqrt()
-        weight = (1 - 0.7 * (self.spread > 0).to(mean)) * (count > 0)  # the first update's statistics count in full
-        self.mean.lerp_(mean, weight)
-        self.spread.lerp_(spread, weight)
-        self.std.copy_((self.spread**2 + (0.3 * self.spread.mean()) ** 2 + 1e-8).sqrt())
 
 
 @torch.no_grad()
@@ -373,26 +344,34 @@ def ppo_loss(agent, batch, mb, args, ent_coef):
     return loss, {name: value.detach() for name, value in losses.items()}
 
 
-def prepare(batch, norm, args):
-    """Fill in advantages and the critic's targets (Algorithm 1, lines 12-13); returns the explained variance."""
-    monte_carlo, _ = gae(batch.rewards, torch.zeros_like(batch.values), batch.alive, args.gamma, 1.0)
+def prepare(batch, args):
+    """Fill in advantages and the critic's targets (Algorithm 1, lines 12-13); returns the explained variance.
+
+    --return-norm time: V(s, t) = mean_t + std_t critic(s), from these episodes' returns from step t on. They share the
+    clock, so most of a return is common to all; the critic is left with what differs between them.
+    """
+    alive, mean, std = batch.alive, 0.0, 1.0
     if args.return_norm == "time":
-        norm.observe(monte_carlo, batch.alive)
-    values, valid = norm.mean + norm.std * batch.values, batch.alive.bool()
-    batch.advantages, returns = gae(batch.rewards, values, batch.alive, args.gamma, args.gae_lambda)
-    batch.returns = ((monte_carlo if args.return_norm == "time" else returns) - norm.mean) / norm.std
+        target, _ = gae(batch.rewards, torch.zeros_like(batch.values), alive, args.gamma, 1.0)  # Monte-Carlo returns
+        average = lambda x: (x * alive).sum(dim=1, keepdim=True) / alive.sum(dim=1, keepdim=True).clamp(min=1)  # noqa: E731
+        mean = average(target)
+        variance = average((target - mean) ** 2)
+        std = (variance + 0.09 * variance.sqrt().mean() ** 2 + 1e-8).sqrt()  # some steps have next to no spread
+    values, valid = mean + std * batch.values, alive.bool()
+    batch.advantages, returns = gae(batch.rewards, values, alive, args.gamma, args.gae_lambda)
+    batch.returns = (target - mean) / std if args.return_norm == "time" else returns
     if args.norm_adv:
         adv = batch.advantages[valid]
         batch.advantages = (batch.advantages - adv.mean()) / (adv.std() + 1e-8)
     return 1 - (returns - values)[valid].var() / returns[valid].var()
 
 
-def update(agent, average, optimizer, norm, batch, args, ent_coef, target_kl):
+def update(agent, average, optimizer, batch, args, ent_coef, target_kl):
     """K epochs of minibatches of whole episodes (Algorithm 1, lines 14-19); returns the mean of each logged loss.
 
     Raises FloatingPointError, before the optimiser moves the weights, when a loss or the gradient is not finite.
     """
-    explained_variance, log, N = prepare(batch, norm, args), [], batch.alive.shape[1]
+    explained_variance, log, N = prepare(batch, args), [], batch.alive.shape[1]
     orders = [torch.randperm(N, device=batch.alive.device) for _ in range(args.update_epochs)]
     minibatches = [(k + 1, mb) for order in orders for k, mb in enumerate(order.tensor_split(args.num_minibatches))]
     for minibatch, mb in minibatches:
@@ -453,8 +432,8 @@ RANGES = {  # lowest and highest value of every numeric flag; NaN and infinity a
 }
 CHOICES = {"env_id": ENV_IDS, "action_frame": ("local", "eci"), "guidance": ("none", "linear", "knots")}
 CHOICES |= {"lr_schedule": ("linear", "kl"), "return_norm": ("none", "time"), "noise": ("learned", "schedule", "gated")}
-NETWORK = ["num_blocks", "embed_dim", "num_heads", "memory_length", "mlp_dim", "hidden_dim"]
-POLICY = {name: type(getattr(Args, name)) for name in ["env_id", *ENV_OPTIONS, *NETWORK]}  # a checkpoint decides
+NETWORK = ("num_blocks", "embed_dim", "num_heads", "memory_length", "mlp_dim", "hidden_dim")
+POLICY = {name: type(getattr(Args, name)) for name in ("env_id", *ENV_OPTIONS, *NETWORK)}  # a checkpoint decides
 
 
 def fail(message):
@@ -590,20 +569,20 @@ def log_scalars(writer, prefix, values, global_step):
 
 def log_update(writer, args, progress, batch, episodes, losses, learning_rate, metrics):
     """CleanRL's tags for one update and, with each evaluation or a hundred times a run, a line to follow it by."""
-    iteration, total, seconds = progress["total_updates"], args.total_updates, progress["wall_seconds"]
+    iteration, step, seconds = (progress[name] for name in ("total_updates", "global_step", "wall_seconds"))
     charts = {"episodic_return": episodes["episodic_return"].mean().item(), "learning_rate": learning_rate}
-    charts |= {"episodic_length": batch.alive.sum(dim=0).mean().item(), "SPS": int(progress["global_step"] / seconds)}
-    log_scalars(writer, "charts", charts, progress["global_step"])
-    log_scalars(writer, "losses", losses, progress["global_step"])
-    if iteration % (args.eval_every or max(1, total // 100)) == 0 or iteration == 1:
-        clock = f"{seconds / 60:.1f} min gone, {(total - iteration) * seconds / iteration / 60:.1f} to go"
-        steps = f"{progress['global_step']} steps"
-        print(f"update {iteration}/{total}, {steps}, {clock}: {describe(episodes, metrics)}", flush=True)
+    charts |= {"episodic_length": batch.alive.sum(dim=0).mean().item(), "SPS": int(step / seconds)}
+    log_scalars(writer, "charts", charts, step)
+    log_scalars(writer, "losses", losses, step)
+    if iteration % (args.eval_every or max(1, args.total_updates // 100)) == 0 or iteration == 1:
+        clock = f"{seconds / 60:.1f} min gone, {(args.total_updates - iteration) * seconds / iteration / 60:.1f} to go"
+        line = f"update {iteration}/{args.total_updates}, {step} steps, {clock}"
+        print(f"{line}: {describe(episodes, metrics)}", flush=True)
 
 
 def train(args, modules, envs, writer, run_dir, progress):
     """Algorithm 1; returns the training state after the last whole update, which Ctrl-C makes the last one."""
-    agent, average, optimizer, norm = modules.values()
+    agent, average, optimizer = modules.values()
     state, metrics = training_state(args, modules, envs, progress), {}
     try:
         for iteration in range(progress["total_updates"] + 1, args.total_updates + 1):
@@ -611,7 +590,7 @@ def train(args, modules, envs, writer, run_dir, progress):
             ent_coef, target_kl = begin_update(args, agent, optimizer, envs, (iteration, args.total_updates))
             learning_rate = optimizer.param_groups[0]["lr"]
             batch, episodes = rollout(agent, envs, args.reward_scale, args.memory_noise)
-            losses = update(agent, average, optimizer, norm, batch, args, ent_coef, target_kl)
+            losses = update(*modules.values(), batch, args, ent_coef, target_kl)
             end_update(args, agent, optimizer, episodes, losses["approx_kl"], target_kl)
             progress = {**progress, "total_updates": iteration}
             progress["global_step"] += int(batch.alive.sum())
@@ -638,8 +617,7 @@ def run(args, agent, envs, saved):
     run_dir = Path(args.resume or f"runs/{args.env_id}__{args.exp_name}__{args.seed}__{int(time.time())}")
     average = AveragedModel(agent, multi_avg_fn=get_ema_multi_avg_fn(args.weight_average))
     optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
-    norm = ReturnNorm(envs.episode_steps).to(agent.actor_logstd.device)
-    modules = {"agent": agent, "average": average, "optimizer": optimizer, "norm": norm}
+    modules = {"agent": agent, "average": average, "optimizer": optimizer}
     progress = {"seed": args.seed, "total_updates": 0, "global_step": 0, "wall_seconds": 0.0}
     if args.resume is not None:
         progress = restore(saved, run_dir, modules, envs)
