@@ -289,16 +289,16 @@ def waypoint_reference(env_id: str, x0, processes: int | None = None) -> dict:
 SEGMENTS = 80
 GAUSS_POINTS = (1 + np.polynomial.legendre.leggauss(4)[0]) / 2  # in (0, 1)
 TILT_TIME = 280.0  # s in which the guess tilts from straight up to the horizon
-FLOOR = 1.0  # m, the lowest altitude: without drag the optimum would fly through the ground
 
 
 class Ascent(NamedTuple):
-    """What is solved: a vehicle, its final time free (heaviest) or the table's (least turning), a ceiling in m."""
+    """What is solved: a vehicle, final time free (heaviest) or the table's (least turning), altitude bounds in m."""
 
     key: str
     rocket: Rocket = ROCKET
     free: bool = True
     ceiling: float = np.inf
+    floor: float = 1.0  # m
 
 
 ASCENTS = {
@@ -308,7 +308,7 @@ ASCENTS = {
         Ascent("free_table_isp", replace(ROCKET, table_isp=True)),
         Ascent("fixed", free=False),
         Ascent("fixed_capped", free=False, ceiling=250e3),
-        Ascent("drag_free", replace(ROCKET, Cd=0.0)),
+        Ascent("drag_free", replace(ROCKET, Cd=0.0), floor=5.0),  # else its optimum, held over steps, skims the ground
     )
 }
 
@@ -341,14 +341,12 @@ def collocation_mesh(case: Ascent, end: float, segments: int) -> Mesh:
     return Mesh(t, stretch, t_u, np.arange(len(t_u)), (start, stop), len(GAUSS_POINTS))
 
 
-def held_mesh(case: Ascent, end: float) -> Mesh:
-    """The environment's steps, cut at the events, each with one direction; only the last one's length can change."""
-    rocket = case.rocket
+def held_mesh(rocket: Rocket, end: float) -> Mesh:
+    """The environment's steps until a fixed end, cut at the events, with one direction each."""
     t_u = rocket.dt * np.arange(np.ceil(end / rocket.dt - 1e-9))
     t = np.unique([*t_u, *(arc[1] for arc in rocket.arcs() if arc[1] < end), end])
-    final_time = (t[-2], t[-2] + rocket.dt) if case.free else (end, end)
     column = np.searchsorted(t_u, t[:-1], side="right") - 1
-    return Mesh(t, (t == end).astype(float), t_u, column, final_time, 0)
+    return Mesh(t, np.zeros(len(t)), t_u, column, (end, end), 0)
 
 
 def collocation(rocket: Rocket):
@@ -445,7 +443,7 @@ def ascend(case: Ascent, mesh: Mesh, guess: dict) -> dict:
     start = np.concatenate([states.ravel(), interpolate(mesh.t_u, guess["t_u"], guess["u"]).ravel(), mesh.t[-1:]])
     box = np.full(len(start) - 1, 2.0)  # far from any ascent; it keeps IPOPT's first steps near the Earth
     equal = np.zeros(program["g"].numel() - n)
-    low, high = (np.append(equal, np.full(n, 1 + h / rocket.Re)) for h in (FLOOR, case.ceiling))
+    low, high = (np.append(equal, np.full(n, 1 + h / rocket.Re)) for h in (case.floor, case.ceiling))
     lbx, ubx = np.append(-box, mesh.final_time[0]), np.append(box, mesh.final_time[1])
     solution = solve(x0=start, lbx=lbx, ubx=ubx, lbg=low, ubg=high)
     status = solve.stats()["return_status"]
@@ -513,27 +511,23 @@ def nine_pitch_angles(env_id: str, flight: dict) -> dict:
 def solve_ascent(key: str):
     """One of `ASCENTS`: its numbers, its flight by the environment, and the collocation (None if the time is fixed).
 
-    With free final time, mass, time and error are the collocation's. Its directions at mid-step, held over the steps,
-    miss the target by `held_error_norm`, and held ones cannot be as fast; so the heaviest ascent with held directions
-    is solved from there, and that one is flown. Raises RuntimeError where it misses by more than `MISS_TOLERANCE`.
+    With free final time the collocation's directions at mid-step are held over the environment's steps; with fixed time
+    the program has these steps itself. Raises RuntimeError where the flight misses by more than `MISS_TOLERANCE`.
     """
-    case, begin, numbers, optimum = ASCENTS[key], time.perf_counter(), {}, None
+    case, begin, optimum = ASCENTS[key], time.perf_counter(), None
     rocket = case.rocket
     if case.free:
-        guess = optimum = collocate(case)
-        mesh = held_mesh(case, optimum["final_time"])
-        middle = (mesh.t_u + np.append(mesh.t_u[1:], mesh.t[-1])) / 2
-        directions = CubicSpline(optimum["t_u"], optimum["u"])(middle)
-        held = fly_directions(FIXED, rocket, directions, optimum["final_time"])
-        numbers["held_error_norm"] = held["error_norm"]
+        solution = optimum = collocate(case)
+        t = np.append(rocket.dt * np.arange(np.ceil(optimum["final_time"] / rocket.dt)), optimum["final_time"])
+        directions = CubicSpline(optimum["t_u"], optimum["u"])((t[:-1] + t[1:]) / 2)
     else:
-        mesh, guess = held_mesh(case, rocket.end_time), cold_start(case, rocket.end_time)
-    steps = ascend(case, mesh, guess)
-    seconds, solution = time.perf_counter() - begin, optimum or steps
-    flight = fly_directions(FIXED, rocket, steps["u"], steps["final_time"])
+        solution = ascend(case, held_mesh(rocket, rocket.end_time), cold_start(case, rocket.end_time))
+        directions = solution["u"]
+    seconds = time.perf_counter() - begin
+    flight = fly_directions(FIXED, rocket, directions, solution["final_time"])
     if not flight["error_norm"] <= MISS_TOLERANCE:
         raise RuntimeError(f"rocket ascent {key}: flown by the environment it misses by {flight['error_norm']}")
-    numbers |= {"final_mass_kg": solution["final_mass"], "final_time_s": solution["final_time"]}
+    numbers = {"final_mass_kg": solution["final_mass"], "final_time_s": solution["final_time"]}
     numbers |= {"error_norm": np.linalg.norm(envs.terminal_error(solution["y"][-1], rocket))}
     numbers |= {f"replay_{name}": flight[name] for name in ("error_norm", "final_mass_kg", "final_time_s")}
     numbers |= {"turning": (np.diff(flight["u"], axis=0) ** 2).sum(), "max_altitude_km": flight["max_altitude_km"]}
