@@ -600,16 +600,17 @@ def guidance_reward(u, up, along, pitch, weight):
     return np.where(np.isnan(pitch), 0.0, -weight * (1 - cosine))
 
 
-def penalties(altitude, time, turn, burnt, mass_weight):
-    """R_penalties = -40 1[h < 0] - 0.024 o - 0.024 s - 0.001 |u_t - u_{t-1}| - w_m (kg burnt in phase 4) / 100 kg.
+def penalties(altitude, time, turn, burnt, left, mass_weight):
+    """R_penalties = -40 c - 0.024 o - 0.024 s - 0.001 |u_t - u_{t-1}| - w_m (b + c l) / 100 kg.
 
-    o = clip((h - 245 km) / 100 km, 0, 1), overshoot; s = clip((110 km - h) / 30 km, 0, 1) after 300 s, a dip into the
-    air at orbital speed. A crash must cost more than the worst miss. Altitude in m and time in s at the step's end;
-    burnt counts in steps that begin in phase 4.
+    c = 1[h < 0], a crash, which must cost more than the worst miss; o = clip((h - 245 km) / 100 km, 0, 1), overshoot;
+    s = clip((110 km - h) / 30 km, 0, 1) after 300 s, a dip into the air at orbital speed; b (kg), the propellant that a
+    step of the last phase burns, l, what a crash leaves of it. Altitude h (m), time (s): the step's end's.
     """
+    crash = altitude < 0
     overshoot = np.minimum(np.maximum((altitude - 245e3) / 100e3, 0.0), 1.0)
     sag = np.minimum(np.maximum((110e3 - altitude) / 30e3, 0.0), 1.0) * (time > 300.0)
-    return -40.0 * (altitude < 0) - 0.024 * (overshoot + sag) - 0.001 * turn - mass_weight * burnt / 100.0
+    return -40.0 * crash - 0.024 * (overshoot + sag) - 0.001 * turn - mass_weight * (burnt + crash * left) / 100.0
 
 
 def terminal_reward(distance):
@@ -683,6 +684,10 @@ class RocketVectorEnv(BatchedEnv):
             raise ValueError(f"action_frame is {action_frame!r}; it must be one of {', '.join(ACTION_FRAMES)}")
         self.rocket = replace(rocket, table_isp=table_isp or rocket.table_isp)
         self._last_phase = len(rocket.burns) - 1
+        self._propellant = sum(n * engine.propellant for n, engine in rocket.burns[-1].engines)  # of the last stage
+        self._dry_mass = rocket.payload + sum(
+            n * (engine.total_mass - engine.propellant) for n, engine in rocket.burns[-1].engines
+        )
         self.cutoff, self.action_frame, self.observe_phase = cutoff, action_frame, observe_phase
         self.mass_weight, self.trajectory_weight, self.guidance_weight, self.guidance = 0.0, 0.0, 0.1, "none"
         x0 = self.rocket.x0
@@ -849,7 +854,8 @@ class RocketVectorEnv(BatchedEnv):
         if REFERENCE_PITCH[self.guidance] is not None:
             pitch = np.radians(np.interp(self._grid[t], *REFERENCE_PITCH[self.guidance], right=np.nan))
             parts[2] = guidance_reward(u, *local_frame(before, self._axes[2])[:2], pitch, self.guidance_weight)
-        parts[3] = penalties(altitude, self.time, turn, burnt, self.mass_weight)
+        left = np.minimum(self.y[6] - self._dry_mass, self._propellant)
+        parts[3] = penalties(altitude, self.time, turn, burnt, left, self.mass_weight)
         parts[4, done] = terminal_reward(distance[done])
         self._parts += parts
         self._distance, self._energy = distance, energy

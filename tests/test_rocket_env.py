@@ -772,6 +772,8 @@ def expected_parts(seen, u, final, mass_weight, trajectory_weight, guidance_weig
             parts[k, 3] -= 0.001 * np.linalg.norm(u[k] - u[k - 1])
         if begin > 261:
             parts[k, 3] -= mass_weight * (before[6] - after[6]) / 100
+        if altitude < 0:
+            parts[k, 3] -= mass_weight * min(after[6] - 6644, 16820) / 100
         if k == len(u) - 1:
             parts[k, 4] = -2 * math.log(1 + goal_distance(after) / 0.01)
     return parts
@@ -863,22 +865,21 @@ def test_reward_functions_at_points_computed_by_hand():
     for pitch, expected in ((90, -0.04), (0, -0.1), (30, -0.07), (np.nan, 0.0)):
         got = guidance_reward(u, *frame[:2], np.radians([pitch]), 0.1)
         assert got[0] == pytest.approx(expected, abs=1e-15)
-    hand = [  # altitude, time, turn, burnt, mass weight; value
-        ((200e3, 500, 0.0, 0.0, 0.0), 0.0),
-        ((-1.0, 10, 0.0, 0.0, 0.0), -40.0),
-        ((0.0, 10, 0.0, 0.0, 0.0), 0.0),
-        ((245e3, 500, 0.0, 0.0, 0.0), 0.0),
-        ((295e3, 100, 0.0, 0.0, 0.0), -0.012),
-        ((400e3, 500, 0.0, 0.0, 0.0), -0.024),
-        ((95e3, 500, 0.0, 0.0, 0.0), -0.012),
-        ((95e3, 300, 0.0, 0.0, 0.0), 0.0),
-        ((50e3, 302, 0.0, 0.0, 0.0), -0.024),
-        ((-1.0, 500, 2.0, 50.0, 0.4), -40 - 0.024 - 0.002 - 0.2),
-        ((200e3, 500, 0.5, 48.0, 1.0), -0.0005 - 0.48),
+    hand = [  # altitude, time, turn, burnt, left, mass weight; value
+        ((200e3, 500, 0.0, 0.0, 9e3, 0.0), 0.0),
+        ((-1.0, 10, 0.0, 0.0, 9e3, 0.0), -40.0),
+        ((0.0, 10, 0.0, 0.0, 9e3, 1.0), 0.0),
+        ((245e3, 500, 0.0, 0.0, 9e3, 0.0), 0.0),
+        ((295e3, 100, 0.0, 0.0, 9e3, 0.0), -0.012),
+        ((400e3, 500, 0.0, 0.0, 9e3, 0.0), -0.024),
+        ((95e3, 500, 0.0, 0.0, 9e3, 0.0), -0.012),
+        ((95e3, 300, 0.0, 0.0, 9e3, 0.0), 0.0),
+        ((50e3, 302, 0.0, 0.0, 9e3, 0.0), -0.024),
+        ((-1.0, 500, 2.0, 50.0, 1e3, 0.4), -40 - 0.024 - 0.002 - 0.2 - 4),
+        ((200e3, 500, 0.5, 48.0, 1e3, 1.0), -0.0005 - 0.48),
     ]
-    columns = [np.array(column) for column in zip(*(arguments[:4] for arguments, _ in hand))]
-    weights = np.array([arguments[4] for arguments, _ in hand])
-    np.testing.assert_allclose(penalties(*columns, weights), [value for _, value in hand], rtol=0, atol=1e-15)
+    columns = [np.array(column) for column in zip(*(arguments for arguments, _ in hand))]
+    np.testing.assert_allclose(penalties(*columns), [value for _, value in hand], rtol=0, atol=1e-15)
     np.testing.assert_allclose(terminal_reward(np.array([0.0, 0.01, 0.99])), [0, -2 * math.log(2), -2 * math.log(100)])
     got = precision_points(np.array([0.0, 0.01, 0.02, 1.0]))
     expected = [5200, 2000 + 1600 * (math.exp(-1) + math.exp(-10)), 1600 * math.exp(-2), 0]
