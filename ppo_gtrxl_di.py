@@ -89,9 +89,9 @@ class Args:
     target_kl_final: float | None = None  # the same in the last update (linear in between; none: --target-kl)
     lr_schedule: str = "linear"  # linear, or kl: the learning rate follows half of --target-kl between its two ends
     return_norm: str = "none"  # none, or time: the critic learns returns normalised over the episodes, step by step
-    noise: str = "learned"  # who sets the log-std: learned, schedule (linear), gated (falls when the episodes succeed)
+    noise: str = "learned"  # who sets the log-std: learned, schedule (linear), gated (falls as the episodes succeed)
     log_std: float = 0.0  # initial log of the policy's standard deviation, in the action's unit
-    log_std_final: float = -4.0  # with schedule the last update's, with gated the floor
+    log_std_final: float = -4.0  # with schedule the last update's, with gated the lowest (--log-std: the highest)
     noise_decay: float = 0.985  # gated: factor on the standard deviation after an update whose episodes succeed
     weight_average: float = 0.998  # decay of the averaged weights used in evaluation (0: off)
 
@@ -115,9 +115,10 @@ def set_curriculum(envs, args, progress):
         envs.radius_scale = args.radius_curriculum ** max(0.0, 1 - progress / 0.6)
 
 
-def succeeded(episodes):
-    """Whether --noise gated lowers the noise: 85 % of the sampled episodes hit every circle."""
-    return episodes["hit"].all(axis=1).mean() >= 0.85
+def noise_trend(episodes):
+    """--noise gated: -1 lowers the noise (85 % of the sampled episodes hit every circle), 1 raises it (not half)."""
+    hits = episodes["hit"].all(axis=1).mean()
+    return -1 if hits >= 0.85 else int(hits < 0.5)
 
 
 def describe(episodes, metrics):
@@ -414,8 +415,9 @@ def end_update(args, agent, optimizer, episodes, approx_kl, target_kl):
     if args.lr_schedule == "kl":
         factor = 1 / 1.3 if approx_kl > 0.75 * target_kl else 1.2 if approx_kl < target_kl / 3 else 1.0
         group["lr"] = min(max(group["lr"] * factor, args.learning_rate_final), args.learning_rate)
-    if args.noise == "gated" and succeeded(episodes):
-        agent.actor_logstd.add_(math.log(args.noise_decay)).clamp_(min=args.log_std_final)
+    if args.noise == "gated":
+        step = -math.log(args.noise_decay) * noise_trend(episodes)
+        agent.actor_logstd.add_(step).clamp_(args.log_std_final, args.log_std)
 
 
 # Shared: arguments ----------------------------------------------------------------------------------------------------

@@ -92,9 +92,9 @@ class Args:
     target_kl_final: float | None = 0.006  # the same in the last update (linear in between; none: --target-kl)
     lr_schedule: str = "kl"  # linear, or kl: the learning rate follows half of --target-kl between its two ends
     return_norm: str = "time"  # none, or time: the critic learns returns normalised over the episodes, step by step
-    noise: str = "gated"  # who sets the log-std: learned, schedule (linear), gated (falls when the episodes succeed)
+    noise: str = "gated"  # who sets the log-std: learned, schedule (linear), gated (falls as the episodes succeed)
     log_std: float = -1.4  # initial log of the policy's standard deviation, in the action's unit
-    log_std_final: float = -3.9  # with schedule the last update's, with gated the floor
+    log_std_final: float = -3.9  # with schedule the last update's, with gated the lowest (--log-std: the highest)
     noise_decay: float = 0.985  # gated: factor on the standard deviation after an update whose episodes succeed
     weight_average: float = 0.998  # decay of the averaged weights used in evaluation (0: off)
 
@@ -132,9 +132,10 @@ def set_curriculum(envs, args, progress):
     envs.mass_weight = args.mass_weight * max(0.0, 2 * progress - 1) * envs.cutoff
 
 
-def succeeded(episodes):
-    """Whether --noise gated lowers the noise: half of the sampled episodes end near the target orbit."""
-    return np.median(episodes["error_norm"]) < 0.03
+def noise_trend(episodes):
+    """--noise gated: -1 lowers the noise (half of the sampled episodes end near the orbit), 1 raises it (far off)."""
+    error = np.median(episodes["error_norm"])
+    return -1 if error < 0.02 else int(error > 0.06)
 
 
 def describe(episodes, metrics):
@@ -433,8 +434,9 @@ def end_update(args, agent, optimizer, episodes, approx_kl, target_kl):
     if args.lr_schedule == "kl":
         factor = 1 / 1.3 if approx_kl > 0.75 * target_kl else 1.2 if approx_kl < target_kl / 3 else 1.0
         group["lr"] = min(max(group["lr"] * factor, args.learning_rate_final), args.learning_rate)
-    if args.noise == "gated" and succeeded(episodes):
-        agent.actor_logstd.add_(math.log(args.noise_decay)).clamp_(min=args.log_std_final)
+    if args.noise == "gated":
+        step = -math.log(args.noise_decay) * noise_trend(episodes)
+        agent.actor_logstd.add_(step).clamp_(args.log_std_final, args.log_std)
 
 
 # Shared: arguments ----------------------------------------------------------------------------------------------------

@@ -151,17 +151,18 @@ def test_learning_rate_follows_the_kl(uneven_envs, kl, rate):
     assert optimizer.param_groups[0]["lr"] == pytest.approx(1e-3 if rate > 5e-4 else 1e-5 if rate < 5e-4 else 5e-4)
 
 
-@pytest.mark.parametrize("hits, factor", [(17, 0.9), (16, 1.0)])
-def test_gated_noise_falls_only_with_success(uneven_envs, hits, factor):
-    """17 of 20 episodes are 85 %; the floor is --log-std-final."""
-    args = make_args(noise="gated", noise_decay=0.9, log_std=-0.5, log_std_final=-1.0)
+@pytest.mark.parametrize("hits, factor", [(17, 0.9), (16, 1.0), (10, 1.0), (9, 1 / 0.9)])
+def test_gated_noise_follows_success(uneven_envs, hits, factor):
+    """17 of 20 episodes are 85 %, 10 are half; it stays between --log-std-final and --log-std."""
+    args = make_args(noise="gated", noise_decay=0.9, log_std=0.0, log_std_final=-1.0)
     agent = make_agent(args, uneven_envs([1]))
+    agent.actor_logstd.data.fill_(-0.5)
     optimizer, episodes = RecordingAdam(agent), {"hit": np.arange(20)[:, None] < hits}
     script.end_update(args, agent, optimizer, episodes, 0.0, None)
     assert agent.actor_logstd.item() == pytest.approx(-0.5 + math.log(factor))
     for _ in range(20):
         script.end_update(args, agent, optimizer, episodes, 0.0, None)
-    assert agent.actor_logstd.item() == pytest.approx(-1.0 if factor < 1 else -0.5)
+    assert agent.actor_logstd.item() == pytest.approx({17: -1.0, 9: 0.0}.get(hits, -0.5))
 
 
 @pytest.mark.parametrize("noise", ["learned", "schedule", "gated"])
