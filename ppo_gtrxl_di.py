@@ -109,6 +109,11 @@ def features(agent, obs):
     return obs / agent.observation_scale
 
 
+def mean_action(output, action_scale):
+    """The policy's mean in the action's unit; the environment clips it at the bound."""
+    return output * action_scale
+
+
 def set_curriculum(envs, args, progress):
     """Training radius of the waypoints: K r at first, shrinking geometrically to r over 60 % of the updates."""
     if len(envs.problem.phases) > 1:
@@ -262,8 +267,8 @@ class Agent(nn.Module):
         return x
 
     def get_mean_action(self, hidden):
-        """The policy's mean in the action's unit; the environment clips it at the bound."""
-        return self.actor(hidden) * self.action_scale
+        """What evaluation flies: the policy without its noise."""
+        return mean_action(self.actor(hidden), self.action_scale)
 
     def get_action_and_value(self, hidden, action=None):
         """Sample (or take) the action: its value, log-probability, the policy's entropy and the critic's output."""
