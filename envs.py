@@ -753,7 +753,9 @@ class RocketVectorEnv(BatchedEnv):
         return np.abs(error).sum(axis=0), specific_energy(self.y, self.rocket.mu)
 
     def _observe(self):
-        return np.column_stack([self.y.T, self._clock[self.t]])
+        obs = np.empty((self.num_envs, 9))
+        obs[:, :7], obs[:, 7:] = self.y.T, self._clock[self.t]
+        return obs
 
     def _directions(self, actions):
         """Unit thrust directions in ECI (3, N) of actions (N, 3); ValueError names the first of length zero."""

@@ -359,9 +359,9 @@ def prepare(batch, args):
     alive, mean, std = batch.alive, 0.0, 1.0
     if args.return_norm == "time":
         target, _ = gae(batch.rewards, torch.zeros_like(batch.values), alive, args.gamma, 1.0)  # Monte-Carlo returns
-        average = lambda x: (x * alive).sum(dim=1, keepdim=True) / alive.sum(dim=1, keepdim=True).clamp(min=1)  # noqa: E731
-        mean = average(target)
-        variance = average((target - mean) ** 2)
+        count = alive.sum(dim=1, keepdim=True).clamp(min=1)
+        mean = (target * alive).sum(dim=1, keepdim=True) / count
+        variance = ((target - mean) ** 2 * alive).sum(dim=1, keepdim=True) / count
         std = (variance + 0.09 * variance.sqrt().mean() ** 2 + 1e-8).sqrt()  # some steps have next to no spread
     values, valid = mean + std * batch.values, alive.bool()
     batch.advantages, returns = gae(batch.rewards, values, alive, args.gamma, args.gae_lambda)

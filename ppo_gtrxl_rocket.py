@@ -74,29 +74,29 @@ class Args:
     memory_noise: float = 0.1  # spread of the memory before an episode's start in training (Algorithm 1, line 5)
 
     # PPO
-    total_updates: int = 450  # number of updates
-    num_envs: int = 64  # number of parallel environments, each flying one episode per update
+    total_updates: int = 400  # number of updates
+    num_envs: int = 32  # number of parallel environments, each flying one episode per update
     learning_rate: float = 3e-4  # learning rate of the first update
     learning_rate_final: float = 1e-5  # learning rate of the last update (linear in between)
     gamma: float = 1.0  # the discount factor gamma
     gae_lambda: float = 0.985  # the lambda for the general advantage estimation
     num_minibatches: int = 8  # the number of mini-batches of whole episodes
-    update_epochs: int = 3  # the K epochs to update the policy
+    update_epochs: int = 6  # the K epochs to update the policy
     norm_adv: bool = True  # normalise the advantages over an update
     clip_coef: float = 0.2  # the surrogate clipping coefficient
     ent_coef: float = 0.0  # coefficient of the entropy in the first update
     ent_coef_final: float = 0.0  # coefficient of the entropy in the last update (linear in between)
     vf_coef: float = 0.5  # coefficient of the value function
     max_grad_norm: float = 0.5  # the maximum norm for the gradient clipping
-    target_kl: float | None = 0.015  # KL divergence from which an update takes no further step
-    target_kl_final: float | None = 0.008  # the same in the last update (linear in between; none: --target-kl)
+    target_kl: float | None = 0.02  # KL divergence from which an update takes no further step
+    target_kl_final: float | None = 0.01  # the same in the last update (linear in between; none: --target-kl)
     lr_schedule: str = "kl"  # linear, or kl: the learning rate follows half of --target-kl between its two ends
     return_norm: str = "time"  # none, or time: the critic learns returns normalised over the episodes, step by step
     noise: str = "gated"  # who sets the log-std: learned, schedule (linear), gated (falls as the episodes succeed)
-    log_std: float = -1.4  # initial log of the policy's standard deviation, in the action's unit
+    log_std: float = -1.9  # initial log of the policy's standard deviation, in the action's unit
     log_std_final: float = -3.9  # with schedule the last update's, with gated the lowest (--log-std: the highest)
     noise_decay: float = 0.98  # gated: factor on the standard deviation after an update whose episodes succeed
-    weight_average: float = 0.998  # decay of the averaged weights used in evaluation (0: off)
+    weight_average: float = 0.999  # decay of the averaged weights used in evaluation (0: off)
 
 
 # Problem: what differs from the other scripts -------------------------------------------------------------------------
@@ -376,9 +376,9 @@ def prepare(batch, args):
     alive, mean, std = batch.alive, 0.0, 1.0
     if args.return_norm == "time":
         target, _ = gae(batch.rewards, torch.zeros_like(batch.values), alive, args.gamma, 1.0)  # Monte-Carlo returns
-        average = lambda x: (x * alive).sum(dim=1, keepdim=True) / alive.sum(dim=1, keepdim=True).clamp(min=1)  # noqa: E731
-        mean = average(target)
-        variance = average((target - mean) ** 2)
+        count = alive.sum(dim=1, keepdim=True).clamp(min=1)
+        mean = (target * alive).sum(dim=1, keepdim=True) / count
+        variance = ((target - mean) ** 2 * alive).sum(dim=1, keepdim=True) / count
         std = (variance + 0.09 * variance.sqrt().mean() ** 2 + 1e-8).sqrt()  # some steps have next to no spread
     values, valid = mean + std * batch.values, alive.bool()
     batch.advantages, returns = gae(batch.rewards, values, alive, args.gamma, args.gae_lambda)

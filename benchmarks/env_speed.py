@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import gymnasium as gym
+import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import envs  # noqa: E402
@@ -36,12 +37,17 @@ def main():
     parser.add_argument("--seconds", type=float, default=1.0)
     args = parser.parse_args()
     print(f"{'id':30} {'batch of ' + str(args.num_envs):>14} {'single':>10}   steps/s on one core")
-    for env_id in envs.PROBLEMS:
-        rates = []
-        for env, steps in ((gym.make_vec(env_id, num_envs=args.num_envs), args.num_envs), (gym.make(env_id), 1)):
+    for env_id in (*envs.PROBLEMS, *envs.ROCKETS):
+        rates, rocket = [], env_id in envs.ROCKETS
+        options = {"action_frame": "local"} if rocket else {}
+        batch, single = gym.make_vec(env_id, num_envs=args.num_envs, **options), gym.make(env_id, **options)
+        for env, steps in ((batch, args.num_envs), (single, 1)):
             env.reset(seed=0)
             env.action_space.seed(0)
-            rates.append(steps_per_second(env, env.action_space.sample(), steps, args.seconds))
+            action = env.action_space.sample()
+            if rocket:  # steered at random it falls back to the pad in its first steps
+                action = np.broadcast_to([1.0, 0.3, 0.0], action.shape)
+            rates.append(steps_per_second(env, action, steps, args.seconds))
         print(f"{env_id:30} {rates[0]:14,.0f} {rates[1]:10,.0f}")
 
 
