@@ -77,7 +77,7 @@ class Args:
     total_updates: int = 400  # number of updates
     num_envs: int = 32  # number of parallel environments, each flying one episode per update
     learning_rate: float = 3e-4  # learning rate of the first update
-    learning_rate_final: float = 1e-5  # learning rate of the last update (linear in between)
+    learning_rate_final: float = 1e-5  # learning rate of the last update (linear in between); with kl the lowest
     gamma: float = 1.0  # the discount factor gamma
     gae_lambda: float = 0.985  # the lambda for the general advantage estimation
     num_minibatches: int = 8  # the number of mini-batches of whole episodes

@@ -38,13 +38,14 @@ def main():
     args.env_id, epochs, args.update_epochs = options.env_id or args.env_id, args.update_epochs, 1
     torch.set_num_threads(1)
     torch.manual_seed(args.seed)
-    envs = gym.make_vec(args.env_id, num_envs=args.num_envs)
+    env_options = {name: getattr(args, name) for name in script.ENV_OPTIONS}
+    envs = gym.make_vec(args.env_id, num_envs=args.num_envs, **env_options)
     agent = script.Agent(args, envs)
     average = script.AveragedModel(agent, multi_avg_fn=script.get_ema_multi_avg_fn(args.weight_average))
     optimizer = torch.optim.Adam(agent.parameters(), lr=0.0, eps=1e-5, fused=True)
     fly = lambda: script.rollout(agent, envs, args.reward_scale, args.memory_noise)  # noqa: E731
     rollout_seconds, (batch, _) = median_seconds(fly, options.repeats)
-    learn = lambda: script.update(agent, average, optimizer, batch, args, args.ent_coef)  # noqa: E731
+    learn = lambda: script.update(agent, average, optimizer, batch, args, args.ent_coef, None)  # noqa: E731
     epoch_seconds, _ = median_seconds(learn, options.repeats)
     update_seconds = rollout_seconds + epochs * epoch_seconds
     print(f"{args.env_id}: {args.num_envs} episodes of {envs.episode_steps} steps, one core")
