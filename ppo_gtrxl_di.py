@@ -16,7 +16,7 @@ import json
 import math
 import sys
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import gymnasium as gym
@@ -77,6 +77,7 @@ class Args:
     learning_rate_final: float = 3e-5  # learning rate of the last update (linear in between); with kl the lowest
     gamma: float = 0.99  # the discount factor gamma
     gae_lambda: float = 0.95  # the lambda for the general advantage estimation
+    gae_lambda_final: float | None = None  # the same in the last update (linear in between; none: --gae-lambda)
     num_minibatches: int = 4  # the number of mini-batches of whole episodes
     update_epochs: int = 8  # the K epochs to update the policy
     norm_adv: bool = True  # normalise the advantages over an update
@@ -330,7 +331,7 @@ def gae(rewards, values, alive, gamma, gae_lambda):
     return advantages, advantages + values
 
 
-def ppo_loss(agent, batch, mb, args, ent_coef):
+def ppo_loss(agent, batch, mb, args):
     """-L_CLIP + c1 L_VF - c2 H over the living steps of the episodes `mb`; returns it and what is logged."""
     alive, advantages = batch.alive[:, mb], batch.advantages[:, mb]
     mean = lambda x: (x * alive).sum() / alive.sum()  # noqa: E731
@@ -342,7 +343,7 @@ def ppo_loss(agent, batch, mb, args, ent_coef):
     pg_loss = mean(torch.max(-advantages * ratio, -advantages * clipped))
     v_loss = mean(0.5 * (newvalue - batch.returns[:, mb]) ** 2)
     entropy_loss = mean(entropy)
-    loss = pg_loss - ent_coef * entropy_loss + args.vf_coef * v_loss
+    loss = pg_loss - args.ent_coef * entropy_loss + args.vf_coef * v_loss
     losses = {"policy_loss": pg_loss, "value_loss": v_loss, "entropy": entropy_loss, "total_loss": loss}
     with torch.no_grad():  # http://joschu.net/blog/kl-approx.html
         losses |= {"old_approx_kl": mean(-logratio), "approx_kl": mean((ratio - 1) - logratio)}
@@ -372,7 +373,7 @@ def prepare(batch, args):
     return 1 - (returns - values)[valid].var() / returns[valid].var()
 
 
-def update(agent, average, optimizer, batch, args, ent_coef, target_kl):
+def update(agent, average, optimizer, batch, args):
     """K epochs of minibatches of whole episodes (Algorithm 1, lines 14-19); returns the mean of each logged loss.
 
     Raises FloatingPointError, before the optimiser moves the weights, when a loss or the gradient is not finite.
@@ -381,9 +382,9 @@ def update(agent, average, optimizer, batch, args, ent_coef, target_kl):
     orders = [torch.randperm(N, device=batch.alive.device) for _ in range(args.update_epochs)]
     minibatches = [(k + 1, mb) for order in orders for k, mb in enumerate(order.tensor_split(args.num_minibatches))]
     for minibatch, mb in minibatches:
-        loss, losses = ppo_loss(agent, batch, mb, args, ent_coef)
+        loss, losses = ppo_loss(agent, batch, mb, args)
         log.append(losses)
-        if target_kl is not None and losses["approx_kl"] > target_kl:
+        if args.target_kl is not None and losses["approx_kl"] > args.target_kl:
             break
         optimizer.zero_grad()
         loss.backward()
@@ -404,21 +405,22 @@ def linear_schedule(first, last, iteration, total):
 
 
 def begin_update(args, agent, optimizer, envs, span):
-    """Set what follows a schedule; returns this update's entropy coefficient and KL limit. span: iteration, total."""
+    """Set what follows a schedule; returns the arguments of this update. span: iteration, total."""
     if args.lr_schedule == "linear":
         optimizer.param_groups[0]["lr"] = linear_schedule(args.learning_rate, args.learning_rate_final, *span)
     if args.noise == "schedule":
         agent.actor_logstd.fill_(linear_schedule(args.log_std, args.log_std_final, *span))
     set_curriculum(envs, args, linear_schedule(0.0, 1.0, *span))
-    target_kl = args.target_kl and linear_schedule(args.target_kl, args.target_kl_final or args.target_kl, *span)
-    return linear_schedule(args.ent_coef, args.ent_coef_final, *span), target_kl
+    names = "gae_lambda", "ent_coef", "target_kl"
+    ends = {name: (getattr(args, name), getattr(args, f"{name}_final")) for name in names}
+    return replace(args, **{name: linear_schedule(*pair, *span) for name, pair in ends.items() if None not in pair})
 
 
-def end_update(args, agent, optimizer, episodes, approx_kl, target_kl):
+def end_update(args, agent, optimizer, episodes, approx_kl):
     """Set what follows this update: the learning rate its KL (kl), the noise its episodes (gated)."""
     group = optimizer.param_groups[0]
     if args.lr_schedule == "kl":
-        factor = 1 / 1.3 if approx_kl > 0.75 * target_kl else 1.2 if approx_kl < target_kl / 3 else 1.0
+        factor = 1 / 1.3 if approx_kl > 0.75 * args.target_kl else 1.2 if approx_kl < args.target_kl / 3 else 1.0
         group["lr"] = min(max(group["lr"] * factor, args.learning_rate_final), args.learning_rate)
     if args.noise == "gated":
         step = -math.log(args.noise_decay) * noise_trend(episodes)
@@ -431,7 +433,7 @@ RANGES = {  # lowest and highest value of every numeric flag; NaN and infinity a
     **dict.fromkeys(["total_updates", "num_envs", "num_minibatches", "update_epochs", "radius_curriculum"], (1, 10**6)),
     **dict.fromkeys(["embed_dim", "num_heads", "mlp_dim", "hidden_dim"], (1, 8192)),
     **dict.fromkeys(["learning_rate", "learning_rate_final", "clip_coef", "weight_average"], (0.0, 1.0)),
-    **dict.fromkeys(["gamma", "gae_lambda", "memory_noise"], (0.0, 1.0)),
+    **dict.fromkeys(["gamma", "gae_lambda", "gae_lambda_final", "memory_noise"], (0.0, 1.0)),
     **dict.fromkeys(["ent_coef", "ent_coef_final", "vf_coef", "mass_weight"], (0.0, 1e3)),
     **dict.fromkeys(["reward_scale", "max_grad_norm", "target_kl", "target_kl_final"], (1e-9, 1e9)),
     **dict.fromkeys(["log_std", "log_std_final"], (-5.0, 0.5)),
@@ -594,11 +596,11 @@ def train(args, modules, envs, writer, run_dir, progress):
     try:
         for iteration in range(progress["total_updates"] + 1, args.total_updates + 1):
             start = time.time()
-            ent_coef, target_kl = begin_update(args, agent, optimizer, envs, (iteration, args.total_updates))
+            now = begin_update(args, agent, optimizer, envs, (iteration, args.total_updates))
             learning_rate = optimizer.param_groups[0]["lr"]
             batch, episodes = rollout(agent, envs, args.reward_scale, args.memory_noise)
-            losses = update(*modules.values(), batch, args, ent_coef, target_kl)
-            end_update(args, agent, optimizer, episodes, losses["approx_kl"], target_kl)
+            losses = update(*modules.values(), batch, now)
+            end_update(now, agent, optimizer, episodes, losses["approx_kl"])
             progress = {**progress, "total_updates": iteration}
             progress["global_step"] += int(batch.alive.sum())
             progress["wall_seconds"] += time.time() - start
@@ -658,8 +660,7 @@ def main(argv):
     torch.set_num_threads(args.num_threads or torch.get_num_threads())
     torch.manual_seed(args.seed)
     torch.backends.cudnn.deterministic = args.torch_deterministic
-    options = {name: getattr(args, name) for name in ENV_OPTIONS}
-    envs = gym.make_vec(args.env_id, num_envs=args.num_envs, **options)
+    envs = gym.make_vec(args.env_id, num_envs=args.num_envs, **{name: getattr(args, name) for name in ENV_OPTIONS})
     envs.reset(seed=args.seed)
     agent = Agent(args, envs).to("cuda" if torch.cuda.is_available() and args.cuda else "cpu")
     if args.checkpoint is not None and args.resume is None:

@@ -35,7 +35,8 @@ def main():
     options = parser.parse_args()
     script = importlib.import_module(options.script)
     args = script.Args()
-    args.env_id, epochs, args.update_epochs = options.env_id or args.env_id, args.update_epochs, 1
+    args.env_id, args.target_kl = options.env_id or args.env_id, None
+    epochs, args.update_epochs = args.update_epochs, 1
     torch.set_num_threads(1)
     torch.manual_seed(args.seed)
     env_options = {name: getattr(args, name) for name in script.ENV_OPTIONS}
@@ -45,7 +46,7 @@ def main():
     optimizer = torch.optim.Adam(agent.parameters(), lr=0.0, eps=1e-5, fused=True)
     fly = lambda: script.rollout(agent, envs, args.reward_scale, args.memory_noise)  # noqa: E731
     rollout_seconds, (batch, _) = median_seconds(fly, options.repeats)
-    learn = lambda: script.update(agent, average, optimizer, batch, args, args.ent_coef, None)  # noqa: E731
+    learn = lambda: script.update(agent, average, optimizer, batch, args)  # noqa: E731
     epoch_seconds, _ = median_seconds(learn, options.repeats)
     update_seconds = rollout_seconds + epochs * epoch_seconds
     print(f"{args.env_id}: {args.num_envs} episodes of {envs.episode_steps} steps, one core")

@@ -56,7 +56,7 @@ class Learner:
 
     def update(self):
         modules = self.agent, self.average, self.optimizer
-        return script.update(*modules, self.batch, self.args, 1e-3, self.args.target_kl)
+        return script.update(*modules, self.batch, self.args)
 
 
 @pytest.fixture
@@ -69,9 +69,9 @@ def minibatches(monkeypatch):
     """The episodes of every minibatch, in the order in which `update` asks for their loss."""
     seen, loss = [], script.ppo_loss
 
-    def spy(agent, batch, mb, args, ent_coef):
+    def spy(agent, batch, mb, args):
         seen.append(mb.tolist())
-        return loss(agent, batch, mb, args, ent_coef)
+        return loss(agent, batch, mb, args)
 
     monkeypatch.setattr(script, "ppo_loss", spy)
     return seen
@@ -127,16 +127,18 @@ def schedules(iteration, **changes):
     envs = gym.make_vec(args.env_id, num_envs=1)
     agent = make_agent(args, envs)
     optimizer = RecordingAdam(agent, lr=7.0)
-    returned = script.begin_update(args, agent, optimizer, envs, (iteration, 11))
-    return *returned, optimizer.param_groups[0]["lr"], agent.actor_logstd.item()
+    now = script.begin_update(args, agent, optimizer, envs, (iteration, 11))
+    rate, log_std = optimizer.param_groups[0]["lr"], agent.actor_logstd.item()
+    return now.ent_coef, now.target_kl, now.gae_lambda, rate, log_std
 
 
 def test_schedules_half_way():
     """Update 6 of 11 is half-way; the log-std is linear, so the standard deviation falls geometrically."""
-    assert schedules(6) == pytest.approx((0.3, None, 5.5e-4, -0.5))
-    limits = {"target_kl": 0.03, "target_kl_final": 0.01}
-    assert schedules(6, noise="schedule", log_std_final=-3.5, **limits) == pytest.approx((0.3, 0.02, 5.5e-4, -2.0))
-    assert schedules(6, noise="gated", lr_schedule="kl", target_kl=0.03) == pytest.approx((0.3, 0.03, 7.0, -0.5))
+    assert schedules(6) == pytest.approx((0.3, None, 0.95, 5.5e-4, -0.5))
+    ends = {"target_kl": 0.03, "target_kl_final": 0.01, "gae_lambda": 0.9, "gae_lambda_final": 1.0}
+    assert schedules(6, noise="schedule", log_std_final=-3.5, **ends) == pytest.approx((0.3, 0.02, 0.95, 5.5e-4, -2.0))
+    assert schedules(11, **ends) == pytest.approx((0.1, 0.01, 1.0, 1e-4, -0.5))
+    assert schedules(6, noise="gated", lr_schedule="kl", target_kl=0.03) == pytest.approx((0.3, 0.03, 0.95, 7.0, -0.5))
 
 
 @pytest.mark.parametrize("kl, rate", [(0.005, 6e-4), (0.012, 5e-4), (0.03, 5e-4 / 1.3), (0.0, 6e-4)])
@@ -144,10 +146,10 @@ def test_learning_rate_follows_the_kl(uneven_envs, kl, rate):
     """Towards half of the limit 0.02: unchanged within a factor of 1.5 of it, and never beyond its two ends."""
     args = make_args(lr_schedule="kl", learning_rate=1e-3, learning_rate_final=1e-5, target_kl=0.02)
     optimizer = RecordingAdam(make_agent(args, uneven_envs([1])), lr=5e-4)
-    script.end_update(args, None, optimizer, {}, kl, 0.02)
+    script.end_update(args, None, optimizer, {}, kl)
     assert optimizer.param_groups[0]["lr"] == pytest.approx(rate)
     for _ in range(50):
-        script.end_update(args, None, optimizer, {}, kl, 0.02)
+        script.end_update(args, None, optimizer, {}, kl)
     assert optimizer.param_groups[0]["lr"] == pytest.approx(1e-3 if rate > 5e-4 else 1e-5 if rate < 5e-4 else 5e-4)
 
 
@@ -158,10 +160,10 @@ def test_gated_noise_follows_success(uneven_envs, hits, factor):
     agent = make_agent(args, uneven_envs([1]))
     agent.actor_logstd.data.fill_(-0.5)
     optimizer, episodes = RecordingAdam(agent), {"hit": np.arange(20)[:, None] < hits}
-    script.end_update(args, agent, optimizer, episodes, 0.0, None)
+    script.end_update(args, agent, optimizer, episodes, 0.0)
     assert agent.actor_logstd.item() == pytest.approx(-0.5 + math.log(factor))
     for _ in range(20):
-        script.end_update(args, agent, optimizer, episodes, 0.0, None)
+        script.end_update(args, agent, optimizer, episodes, 0.0)
     assert agent.actor_logstd.item() == pytest.approx({17: -1.0, 9: 0.0}.get(hits, -0.5))
 
 
@@ -253,8 +255,8 @@ def hand_made_batch():
 
 
 def test_loss_is_the_hand_computed_one():
-    args = make_args(clip_coef=0.2, vf_coef=0.25)
-    loss, losses = script.ppo_loss(PrescribedAgent(), hand_made_batch(), torch.tensor([0, 1]), args, 0.01)
+    args = make_args(clip_coef=0.2, vf_coef=0.25, ent_coef=0.01)
+    loss, losses = script.ppo_loss(PrescribedAgent(), hand_made_batch(), torch.tensor([0, 1]), args)
     # L_CLIP, min(r A, clip(r) A) of the five living steps: 1.2, -0.8, 0.5, -1.5, 2.2
     assert losses["policy_loss"].item() == pytest.approx(-(1.2 - 0.8 + 0.5 - 1.5 + 2.2) / 5)
     # half the squared errors 1, 16, 0, 4, 1
@@ -268,8 +270,8 @@ def test_loss_is_the_hand_computed_one():
 
 
 def test_loss_of_a_minibatch_reads_only_its_episodes():
-    args = make_args(clip_coef=0.2, vf_coef=0.25)
-    _, losses = script.ppo_loss(PrescribedAgent(), hand_made_batch(), torch.tensor([1]), args, 0.01)
+    args = make_args(clip_coef=0.2, vf_coef=0.25, ent_coef=0.01)
+    _, losses = script.ppo_loss(PrescribedAgent(), hand_made_batch(), torch.tensor([1]), args)
     assert losses["policy_loss"].item() == pytest.approx(-(-0.8 - 1.5) / 2)
     assert losses["value_loss"].item() == pytest.approx((16 + 4) / 2 / 2)
 
@@ -284,7 +286,7 @@ def test_dead_steps_do_not_touch_the_gradient(learner):
             getattr(run.batch, name)[dead] += garbage
         gae = script.gae(run.batch.rewards, run.batch.values, run.batch.alive, 0.99, 0.95)
         run.batch.advantages, run.batch.returns = gae
-        loss, _ = script.ppo_loss(run.agent, run.batch, torch.arange(3), run.args, 1e-3)
+        loss, _ = script.ppo_loss(run.agent, run.batch, torch.arange(3), run.args)
         loss.backward()
         gradients.append([loss.detach(), *(p.grad for p in run.agent.parameters() if p.grad is not None)])
     torch.testing.assert_close(*gradients, rtol=0, atol=1e-12)
