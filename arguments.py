@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
+import io
 import sys
+from itertools import takewhile
 from pathlib import Path
+
+import tyro
 
 RANGES = {  # lowest and highest value of every numeric flag; NaN and infinity are outside
     **dict.fromkeys(["seed", "eval_seed", "num_threads", "eval_every"], (0, 2**31 - 1)),
@@ -29,6 +34,18 @@ def fail(message):
 def refuse(name, value, allowed):
     """End with one line that names a field of Args as its flag, its value and what is allowed."""
     fail(f"--{name.replace('_', '-')} {value}: {allowed}")
+
+
+def parse(kind, argv):
+    """tyro's reading of a command line into the dataclass `kind`; of its framed errors only the first paragraph."""
+    with contextlib.redirect_stderr(io.StringIO()) as frame:
+        try:
+            return tyro.cli(kind, args=argv)
+        except SystemExit as stop:
+            if not stop.code:  # --help
+                raise
+    lines = (line.strip("│ ") for line in frame.getvalue().splitlines() if line[:1] != "╭")
+    fail(" ".join(takewhile(lambda line: line[:1] not in ("─", "╰"), lines)) + " (--help lists what is allowed)")
 
 
 def check(args, typed, env_ids):

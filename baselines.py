@@ -696,6 +696,8 @@ def replacing(path, mode: str = "wb"):
         with open(temporary, mode, newline=None if "b" in mode else "") as file:
             yield file
         os.replace(temporary, path)
+    except OSError as error:  # of a full disk it would not say which file
+        raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
         temporary.unlink(missing_ok=True)
 

@@ -138,6 +138,10 @@ TRANSITION_STEPS = 5  # the observed target moves from the old waypoint to the n
 # ---------------------------------------------------------------------------------------------------------------------
 
 
+class BadInput(ValueError):
+    """A value or file that a user gave and nothing can be done with; its message is the one line that is shown."""
+
+
 class BatchedEnv(VectorEnv):
     """What every problem shares: step counters, checks of the action, and autoreset in the same step.
 
@@ -178,13 +182,16 @@ class BatchedEnv(VectorEnv):
         return obs, rewards, terminated, np.zeros(self.num_envs, dtype=bool), info
 
     def advance(self, actions):
-        """Fly one step without autoreset: `(obs, rewards, terminated, final_info)`; raises ValueError on a NaN."""
-        actions = np.asarray(actions, dtype=np.float64)
+        """Fly one step without autoreset: `(obs, rewards, terminated, final_info)`. BadInput names a bad action."""
+        actions = np.asarray(actions)
+        if actions.dtype.kind not in "fiu":
+            raise BadInput(f"actions are of type {actions.dtype}; they must be real numbers")
+        actions = actions.astype(np.float64)
         if actions.shape != self.action_space.shape:
-            raise ValueError(f"actions have shape {actions.shape}; expected {self.action_space.shape}")
+            raise BadInput(f"actions have shape {actions.shape}; expected {self.action_space.shape}")
         if not np.isfinite(actions).all():
             bad = int(np.flatnonzero(~np.isfinite(actions).all(axis=1))[0])
-            raise ValueError(f"action of env {bad} at step {self.t[bad]} is {actions[bad].tolist()}; it must be finite")
+            raise BadInput(f"action of env {bad} at step {self.t[bad]} is {actions[bad].tolist()}; it must be finite")
         rewards, terminated, final = self._advance(actions)
         return self._observe(), rewards, terminated, final() if terminated.any() else {}
 
@@ -762,7 +769,7 @@ class RocketVectorEnv(BatchedEnv):
         largest = np.abs(actions).max(axis=1)
         if not largest.all():
             bad = int(np.argmin(largest))
-            raise ValueError(f"action of env {bad} at step {self.t[bad]} is [0, 0, 0]; a direction must have a length")
+            raise BadInput(f"action of env {bad} at step {self.t[bad]} is [0, 0, 0]; a direction must have a length")
         u = actions.T / largest  # before squaring: neither overflow nor underflow
         u /= np.sqrt((u * u).sum(axis=0))
         if self.action_frame == "eci":

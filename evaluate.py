@@ -31,6 +31,7 @@ from matplotlib.ticker import EngFormatter
 import baselines
 import envs
 from baselines import replacing
+from envs import BadInput
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Cases and ratios
@@ -196,10 +197,6 @@ def ratio_lines(metrics: dict) -> list[str]:
 # ---------------------------------------------------------------------------------------------------------------------
 # Files: each is written beside its place and renamed, so that a failure leaves the old one
 # ---------------------------------------------------------------------------------------------------------------------
-
-
-class BadInput(ValueError):
-    """A file or value that a user gave and nothing can be done with; its message is the one line that is shown."""
 
 
 def write_bytes(path, data: bytes):

@@ -11,26 +11,30 @@ Top to bottom: arguments, problem, Gated Transformer-XL, agent, PPO, checkpoints
 from __future__ import annotations
 
 import copy
+import io
 import json
 import math
+import signal
 import sys
 import time
+import zipfile
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import get_type_hints
 
 import gymnasium as gym
 import numpy as np
 import safetensors.torch
 import torch
 import torch.nn.functional as F
-import tyro
 from torch import nn
 from torch.distributions import Normal
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torch.utils.tensorboard import SummaryWriter
 
 import evaluate
-from arguments import check, fail, refuse
+from arguments import check, fail, parse, refuse
 from envs import ROCKET, target_axes, target_orbit
 
 
@@ -451,7 +455,7 @@ POLICY = {name: type(getattr(Args, name)) for name in ("env_id", *ENV_OPTIONS, *
 
 def parse_args(argv):
     """The checked arguments; with --resume the saved training state, with --checkpoint what that file holds."""
-    args, saved = tyro.cli(Args, args=argv), None
+    args, saved = parse(Args, argv), None
     typed = {word.split("=")[0][2:].replace("-", "_").removeprefix("no_") for word in argv if word.startswith("--")}
     if args.resume is not None:
         if refused := typed - {"resume", "cuda", "num_threads"}:
@@ -493,16 +497,21 @@ def restore(state, run_dir, modules, envs):
         torch.cuda.set_rng_state_all(state["rng"]["cuda"][: torch.cuda.device_count()])
         envs.np_random.bit_generator.state = json.loads(state["rng"]["envs"])
         return {name: state["progress"][name] for name in ("seed", "total_updates", "global_step", "wall_seconds")}
-    except (KeyError, RuntimeError, TypeError, ValueError) as error:
+    except Exception as error:  # an edited file fails in many ways, all alike to the user
         fail(f"--resume {run_dir}: its training_state.pt does not fit its own args ({error}); it must be whole")
 
 
 def load_state(run_dir):
     """The training state of a run folder; one line if there is none, or it is damaged or another script's."""
     try:
-        state = torch.load(Path(run_dir) / "training_state.pt", map_location="cpu", weights_only=True)
-        if state["args"].keys() != asdict(Args()).keys() or state["args"]["env_id"] not in ENV_IDS:
+        if damaged := zipfile.ZipFile(path := Path(run_dir) / "training_state.pt").testzip():  # torch checks no CRC
+            raise ValueError(f"{damaged} is damaged")
+        state = torch.load(path, map_location="cpu", weights_only=True)
+        args, kinds = state["args"], get_type_hints(Args)
+        if args.keys() != kinds.keys() or args["env_id"] not in ENV_IDS:
             raise ValueError("of another script")
+        if wrong := [name for name, kind in kinds.items() if not isinstance(args[name], kind)]:
+            raise ValueError(f"{wrong[0]} is {args[wrong[0]]!r}")
     except Exception as error:  # a missing, damaged or foreign file fails in many ways, all alike to the user
         fail(f"--resume {run_dir}: must hold a training_state.pt of {Path(__file__).name} ({error})")
     return state
@@ -510,8 +519,8 @@ def load_state(run_dir):
 
 def save_run(run_dir, state):
     """Write the training state and, derived from it, the weights that evaluation uses; each whole or not at all."""
-    with evaluate.replacing(run_dir / "training_state.pt") as file:
-        torch.save(state, file)
+    torch.save(state, buffer := io.BytesIO())
+    evaluate.write_bytes(run_dir / "training_state.pt", buffer.getbuffer())
     metadata = {"env_id": state["args"]["env_id"], "args": json.dumps(state["args"]), **state["progress"]}
     weights = {k.removeprefix("module."): v.cpu() for k, v in state["average"].items() if k != "n_averaged"}
     data = safetensors.torch.save(weights, {key: str(value) for key, value in metadata.items()})
@@ -560,9 +569,11 @@ def log_update(writer, args, progress, batch, episodes, losses, learning_rate, m
 
 
 def train(args, modules, envs, writer, run_dir, progress):
-    """Algorithm 1; returns the training state after the last whole update, which Ctrl-C makes the last one."""
+    """Algorithm 1; returns the progress. Also what ends it early leaves the state after the last whole update."""
     agent, average, optimizer = modules.values()
     state, metrics = training_state(args, modules, envs, progress), {}
+    save = partial(save_run, run_dir) if args.save_model else lambda state: None
+    save(state)
     try:
         for iteration in range(progress["total_updates"] + 1, args.total_updates + 1):
             start = time.time()
@@ -575,28 +586,28 @@ def train(args, modules, envs, writer, run_dir, progress):
             progress["global_step"] += int(batch.alive.sum())
             progress["wall_seconds"] += time.time() - start
             state = training_state(args, modules, envs, progress)
-            if args.save_model and iteration % SAVE_EVERY == 0:
-                save_run(run_dir, state)
+            if iteration % SAVE_EVERY == 0 or iteration == args.total_updates:
+                save(state)
             if args.eval_every and iteration % args.eval_every == 0:
                 metrics, _ = evaluate_agent(average.module, args, envs, TRAINING_EVAL_SEED, progress)
                 log_scalars(writer, "eval", metrics, progress["global_step"])
             log_update(writer, args, progress, batch, episodes, losses, learning_rate, metrics)
-    except KeyboardInterrupt:
-        pass  # `state` is that of the last whole update
-    except FloatingPointError as error:
-        if args.save_model:
-            save_run(run_dir, state)
-        kept = f"; the last good checkpoint is {run_dir}/training_state.pt" if args.save_model else ""
-        fail(f"update {iteration}: {error}, must be finite{kept}")
-    return state
+    except (KeyboardInterrupt, FloatingPointError) as error:
+        save(state)
+        writer.flush()
+        if isinstance(error, FloatingPointError):
+            kept = f"; the last good checkpoint is {run_dir}/training_state.pt" if args.save_model else ""
+            fail(f"update {iteration}: {error}, must be finite{kept}")
+        kept = f"go on with: python {Path(__file__).name} --resume {run_dir}" if args.save_model else "nothing saved"
+        print(f"stopped after update {state['progress']['total_updates']}; {kept}")
+        raise
+    return progress
 
 
 def run(args, agent, envs, saved):
     """Train (or go on), save, evaluate, print the table."""
     run_dir = Path(args.resume or f"runs/{args.env_id}__{args.exp_name}__{args.seed}__{int(time.time())}")
-    average = AveragedModel(agent, multi_avg_fn=get_ema_multi_avg_fn(args.weight_average))
-    optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
-    modules = {"agent": agent, "average": average, "optimizer": optimizer}
+    modules = make_modules(args, agent)
     progress = {"seed": args.seed, "total_updates": 0, "global_step": 0, "wall_seconds": 0.0}
     if args.resume is not None:
         progress = restore(saved, run_dir, modules, envs)
@@ -605,17 +616,12 @@ def run(args, agent, envs, saved):
         names = {"project": args.wandb_project_name, "entity": args.wandb_entity, "name": run_dir.name}
         wandb.init(**names, sync_tensorboard=True, config=asdict(args), save_code=True)
     run_dir.mkdir(parents=True, exist_ok=args.resume is not None)
+    for leftover in run_dir.glob(".*.tmp"):  # of a writer that was killed
+        leftover.unlink()
     evaluate.write_json(run_dir / "args.json", {**asdict(args), "resume": None})
     writer = SummaryWriter(run_dir, purge_step=progress["global_step"] + 1)
-    state = train(args, modules, envs, writer, run_dir, progress)
-    writer.flush()
-    if args.save_model:
-        save_run(run_dir, state)
-    if (done := state["progress"]["total_updates"]) < args.total_updates:
-        saved = f"go on with: python {Path(__file__).name} --resume {run_dir}" if args.save_model else "nothing saved"
-        print(f"stopped after update {done}; {saved}")
-        sys.exit(130)
-    metrics, arrays = evaluate_agent(average.module, args, envs, args.eval_seed, state["progress"])
+    progress = train(args, modules, envs, writer, run_dir, progress)
+    metrics, arrays = evaluate_agent(modules["average"].module, args, envs, args.eval_seed, progress)
     log_scalars(writer, "eval", metrics, metrics["global_step"])
     writer.close()
     if args.save_model:
@@ -625,6 +631,29 @@ def run(args, agent, envs, saved):
     print(evaluate.table(metrics))
 
 
+def make_agent(args, envs, saved):
+    """A new agent, with the weights of --checkpoint if there is one; one line if they do not fit."""
+    agent = Agent(args, envs).to("cuda" if torch.cuda.is_available() and args.cuda else "cpu")
+    if args.checkpoint is not None and args.resume is None:
+        try:
+            agent.load_state_dict({name: torch.from_numpy(array) for name, array in saved["tensors"].items()})
+        except (RuntimeError, TypeError) as error:
+            fail(f"--checkpoint {args.checkpoint}: its weights do not fit its own args ({error})")
+    return agent
+
+
+def make_modules(args, agent):
+    """All that training changes: the agent, its averaged weights, the optimiser."""
+    average = AveragedModel(agent, multi_avg_fn=get_ema_multi_avg_fn(args.weight_average))
+    optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
+    return {"agent": agent, "average": average, "optimizer": optimizer}
+
+
+def interrupt(signum, _):
+    """Ctrl-C and SIGTERM end a run alike; the exit status tells them apart: 130 and 143."""
+    raise KeyboardInterrupt(128 + signum)
+
+
 def main(argv):
     args, saved = parse_args(argv)
     torch.set_num_threads(args.num_threads or torch.get_num_threads())
@@ -632,12 +661,7 @@ def main(argv):
     torch.backends.cudnn.deterministic = args.torch_deterministic
     envs = gym.make_vec(args.env_id, num_envs=args.num_envs, **{name: getattr(args, name) for name in ENV_OPTIONS})
     envs.reset(seed=args.seed)
-    agent = Agent(args, envs).to("cuda" if torch.cuda.is_available() and args.cuda else "cpu")
-    if args.checkpoint is not None and args.resume is None:
-        try:
-            agent.load_state_dict({name: torch.from_numpy(array) for name, array in saved["tensors"].items()})
-        except RuntimeError as error:
-            fail(f"--checkpoint {args.checkpoint}: its weights do not fit its own args ({error})")
+    agent = make_agent(args, envs, saved)
     if args.eval_only:
         metrics, arrays = evaluate_agent(agent, args, envs, args.eval_seed, saved["progress"])
         evaluate.write(metrics, arrays, args.checkpoint, args.eval_json, args.eval_npz)
@@ -647,7 +671,11 @@ def main(argv):
 
 
 if __name__ == "__main__":
+    for signum in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(signum, interrupt)
     try:
         main(sys.argv[1:])
     except (evaluate.BadInput, OSError) as error:
         fail(error)
+    except KeyboardInterrupt as error:
+        sys.exit(*error.args)

@@ -560,12 +560,11 @@ def assert_resumes(uninterrupted):
 
 
 def test_ctrl_c_and_resume(uninterrupted, fresh_folder, monkeypatch, capsys):
-    """Ctrl-C in the third of four updates: exit code 130, two whole updates saved, the same bits in the end."""
+    """Ctrl-C in the third of four updates: two whole updates saved, the same bits in the end."""
     fresh_folder("ctrl_c")
     stop_in_update(monkeypatch, 3, KeyboardInterrupt())
-    with pytest.raises(SystemExit) as stop:
+    with pytest.raises(KeyboardInterrupt):
         DI.main([*TINY, "--total-updates=4"])
-    assert stop.value.code == 130
     assert f"--resume {run_folder()}" in capsys.readouterr().out
     assert state_of(run_folder())["progress"]["total_updates"] == 2
     assert not (run_folder() / "eval.json").exists()
@@ -587,7 +586,7 @@ def test_resume_of_a_run_that_began_from_a_checkpoint(trained, fresh_folder, mon
     fresh_folder("from_checkpoint")
     stop_in_update(monkeypatch, 2, KeyboardInterrupt())
     argv = [*TINY, f"--checkpoint={trained / 'agent.safetensors'}", "--total-updates=2"]
-    with pytest.raises(SystemExit):
+    with pytest.raises(KeyboardInterrupt):
         DI.main(argv)
     interrupted = run_folder()
     DI.main([f"--resume={interrupted}"])
@@ -604,9 +603,8 @@ def test_ctrl_c_in_an_evaluation_saves_too(fresh_folder, monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(DI.evaluate, "evaluate", interrupted)
-    with pytest.raises((SystemExit, KeyboardInterrupt)) as stop:  # the latter, uncaught, would end pytest
+    with pytest.raises(KeyboardInterrupt):
         DI.main([*TINY, "--total-updates=2", "--eval-every=1"])
-    assert stop.type is SystemExit and stop.value.code == 130
     assert state_of(run_folder())["progress"]["total_updates"] == 1
 
 
@@ -698,12 +696,8 @@ def test_shares_end_at_one(refuses, name):
 
 
 @pytest.mark.parametrize("argv", [["--num-envs", "nan"], ["--num-envs", "2.5"], ["--gamma", "x"], ["--no-such-flag"]])
-def test_tyro_refuses_what_is_no_number(argv, tmp_path, monkeypatch, capsys):
-    """tyro's own parse errors keep their box."""
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit) as stop:
-        DI.main(argv)
-    assert stop.value.code == 2 and argv[0] in capsys.readouterr().err and os.listdir() == []
+def test_what_is_no_number_and_no_flag(refuses, argv):
+    assert argv[0] in refuses(*argv)
 
 
 @pytest.mark.parametrize(

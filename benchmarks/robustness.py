@@ -1,0 +1,340 @@
+"""Try to hurt a run from outside: kills, damaged files, absurd flags and actions, two thousand updates.
+
+    python benchmarks/robustness.py [--kills 50] [--fuzz 10000] [--soak 2000] [--seed 0]
+
+Prints what was tried and how it ended; the first failure is an AssertionError. The tests do the same, fewer times.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import importlib
+import io
+import json
+import multiprocessing
+import os
+import pickle
+import signal
+import sys
+import tempfile
+import time
+from collections import Counter
+from dataclasses import fields
+from pathlib import Path
+from unittest import mock
+
+import gymnasium as gym
+import numpy as np
+import torch
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+import envs  # noqa: E402
+import evaluate  # noqa: E402
+
+SCRIPTS = [importlib.import_module(f"ppo_gtrxl_{name}") for name in ("di", "vdp", "rocket")]
+NETWORK = ["--embed-dim=8", "--num-heads=2", "--num-blocks=1", "--memory-length=4", "--mlp-dim=8", "--hidden-dim=8"]
+TINY = [*NETWORK, "--num-envs=2", "--num-minibatches=2", "--update-epochs=2", "--eval-starts=10", "--num-threads=1"]
+PROCESSES = multiprocessing.get_context("forkserver")  # its children have torch already: each starts at once
+PROCESSES.set_forkserver_preload(["ppo_gtrxl_di"])
+
+
+# --- kills ------------------------------------------------------------------------------------------------------------
+
+
+def train(folder, argv, slow_disk):
+    """In a child: the double integrator's script, saving after every second update; a slow disk writes for 40 ms."""
+    script = importlib.import_module("ppo_gtrxl_di")
+    script.SAVE_EVERY = 2
+
+    def write_slowly(path, data):
+        data = bytes(data)
+        with evaluate.replacing(path) as file:
+            for part in range(20):
+                file.write(data[len(data) * part // 20 : len(data) * (part + 1) // 20])
+                file.flush()
+                time.sleep(0.002)
+
+    if slow_disk:
+        script.evaluate.write_bytes = write_slowly
+    os.chdir(folder)
+    sys.stdout = open(os.devnull, "w")
+    script.main(argv)
+
+
+def start(folder, *argv, slow_disk=False):
+    """A child that trains in `folder`."""
+    process = PROCESSES.Process(target=train, args=(str(folder), list(argv), slow_disk))
+    process.start()
+    return process
+
+
+def finish(folder, *argv):
+    """Train in `folder` to the end; the bits of all that was trained."""
+    process = start(folder, *argv)
+    process.join(600)
+    assert process.exitcode == 0, f"exit code {process.exitcode} of {argv}"
+    (run,) = (folder / "runs").iterdir()
+    assert not list(run.glob(".*.tmp")), f"{run} holds what a killed writer left"
+    state = torch.load(run / "training_state.pt", weights_only=True)
+    weights = evaluate.read_checkpoint(run / "agent.safetensors", {})["tensors"]
+    trained = {name: state[name] for name in ("agent", "average", "optimizer", "rng")}
+    return json.loads(json.dumps([trained, weights], default=lambda array: array.tolist()))  # comparable
+
+
+def kill_and_resume(kills, seed=0):
+    """SIGKILL runs at random moments, every other time in the middle of a write, and resume; the count of each.
+
+    The run that was resumed must end with the bits of the uninterrupted one. Killed before its first checkpoint, it
+    begins anew.
+    """
+    rng, ended = np.random.default_rng(seed), Counter()
+    argv = [*TINY, "--total-updates=12"]
+    for _ in range(2):  # the first one also starts the fork server
+        with tempfile.TemporaryDirectory() as folder:
+            before = time.time()
+            expected = finish(Path(folder), *argv)
+            seconds = time.time() - before
+    for kill in range(kills):
+        with tempfile.TemporaryDirectory() as folder:
+            process = start(folder := Path(folder), *argv, slow_disk=kill % 2)
+            written, moment = f"runs/*/.{rng.choice(['training_state.pt', 'agent.safetensors'])}.*", rng.uniform()
+            time.sleep(seconds * moment)
+            while kill % 2 and process.is_alive() and not list(folder.glob(written)):
+                time.sleep(0.0005)
+            os.kill(process.pid, signal.SIGKILL) if process.is_alive() else None
+            process.join()
+            saved = list(folder.glob("runs/*/training_state.pt"))
+            kind = "after its end" if process.exitcode == 0 else "in a write" if kill % 2 else "at random"
+            ended[kind if saved else "before the first checkpoint"] += 1
+            for run in () if saved else folder.glob("runs/*"):
+                run.rename(folder / "nothing_to_resume")
+            again = [f"--resume={saved[0].parent}"] if saved else argv
+            assert finish(folder, *again) == expected, f"kill {kill}, {kind}: other bits than uninterrupted"
+    return ended
+
+
+# --- fuzzing ----------------------------------------------------------------------------------------------------------
+
+
+def outcome(call, *inputs):
+    """'works', or 'refused' if it ends with one line that begins with "error: "; everything else is raised."""
+    errors = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(errors), contextlib.redirect_stdout(io.StringIO()):
+            call(*inputs)
+    except SystemExit as stop:
+        if not stop.code:
+            return "works"  # --help
+        line = str(stop.code)
+        assert line.startswith("error: ") and "\n" not in line and not errors.getvalue(), (line, errors.getvalue())
+        return "refused"
+    except (envs.BadInput, OSError):
+        return "refused"  # the scripts print it as one line
+    return "works"
+
+
+WORDS = ["", "0", "1", "-1", "3", "4", "8", "1e-3", "0.5", "2.5", "nan", "inf", "-inf", "1e400", "10" * 20, "True"]
+WORDS += ["None", "none", "time", "kl", "gated", "learned", "local", "RocketAscent-v0", "DoubleIntegrator-v0"]
+WORDS += ["/", ".", "runs", "nowhere/file", "\0", "ü\n", "--", "-h", "'; rm -rf x", "[1]", "{}", "%s", "VanDerPol-v0"]
+
+
+def random_arguments(rng, script):
+    """A command line of one to four flags, some mutilated, with values that fit, nearly fit or do not fit at all."""
+    names, argv = [field.name for field in fields(script.Args)], []
+    for _ in range(rng.integers(1, 5)):
+        name = str(rng.choice(names)).replace("_", "-" if rng.random() < 0.9 else "_")
+        if rng.random() < 0.1:
+            name = name[: rng.integers(len(name))] + str(rng.choice(list("xyz-=")))
+        name = f"--no-{name}" if rng.random() < 0.1 else f"--{name}"
+        value = str(rng.choice(WORDS))
+        argv += [[name, value], [f"{name}={value}"], [name], [value]][rng.choice(4, p=[0.5, 0.35, 0.1, 0.05])]
+    return argv
+
+
+def fuzz_arguments(count, seed=0):
+    """Random command lines through a script's parsing and checks, in an empty folder, which must stay empty."""
+    rng, ended = np.random.default_rng(seed), Counter()
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+        for _ in range(count):
+            script = SCRIPTS[rng.integers(3)]
+            argv = random_arguments(rng, script)
+            try:
+                ended[outcome(script.parse_args, argv)] += 1
+            except BaseException as error:
+                raise AssertionError(f"{script.__name__} {argv}: {error!r}") from error
+            assert not os.listdir()
+    return ended
+
+
+def damaged(rng, data):
+    """Bit flips, a cut, bytes in excess, a stretch of zeros or of noise, mostly in the first 3000 bytes."""
+    data = bytearray(data)
+    place = int(rng.integers(min(len(data), 3000) if rng.random() < 0.7 else len(data)))
+    kind = rng.integers(5)
+    if kind == 0:
+        for _ in range(rng.integers(1, 4)):
+            data[min(place + int(rng.integers(100)), len(data) - 1)] ^= 1 << int(rng.integers(8))
+    elif kind == 1:
+        del data[place:]
+    elif kind == 2:
+        data[place:place] = rng.bytes(int(rng.integers(1, 100)))
+    else:
+        length = int(rng.integers(1, 200))
+        data[place : place + length] = bytes(length) if kind == 3 else rng.bytes(length)
+    return bytes(data)
+
+
+class RunsCode:
+    """Unpickling it makes a folder."""
+
+    def __reduce__(self):
+        return os.mkdir, ("executed",)
+
+
+def hostile_state(rng, state):
+    """A training state with one entry of the wrong shape or type, missing, or code that unpickling would run."""
+    state = pickle.loads(pickle.dumps(state))
+    part = state[str(rng.choice(["args", "progress", "rng", "agent", "average", "optimizer"]))]
+    key = list(part)[rng.integers(len(part))]
+    values = [RunsCode(), None, "x", -1, float("nan"), [], {}, torch.zeros(3), torch.zeros(8, 8)]
+    part[key] = values[rng.integers(len(values))]
+    if rng.random() < 0.2:
+        del part[key]
+    return state
+
+
+def parse_at_once(script, **flags):
+    """`parse_args` of these flags without tyro, which takes ten times as long as the rest."""
+    with mock.patch.object(script, "parse", lambda kind, argv: kind(**flags)):
+        return script.parse_args([f"--{name}" for name in flags])
+
+
+def load_checkpoint(script, path):
+    """All that --eval-only does with a file before it flies."""
+    args, saved = parse_at_once(script, eval_only=True, checkpoint=str(path))
+    script.make_agent(args, gym.make_vec(args.env_id, num_envs=args.num_envs), saved)
+
+
+def load_state(script, folder):
+    """All that --resume does with a folder before it trains."""
+    args, saved = parse_at_once(script, resume=str(folder))
+    batch = gym.make_vec(args.env_id, num_envs=args.num_envs)
+    batch.reset(seed=0)
+    script.restore(saved, Path(folder), script.make_modules(args, script.make_agent(args, batch, saved)), batch)
+
+
+def fuzz_checkpoints(count, seed=0):
+    """Damaged agent.safetensors and training_state.pt, and states that fit nothing or would run code."""
+    rng, ended, script = np.random.default_rng(seed), Counter(), SCRIPTS[0]
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+        with contextlib.redirect_stdout(io.StringIO()):
+            script.main([*TINY, "--total-updates=1"])
+        (run,) = Path("runs").iterdir()
+        names = "agent.safetensors", "training_state.pt"
+        whole = {name: (run / name).read_bytes() for name in names}
+        state = torch.load(run / "training_state.pt", weights_only=True)
+        listing = sorted(os.listdir(run))
+        for k in range(count):
+            name = names[k % 2]
+            if k % 4 == 3:
+                torch.save(hostile_state(rng, state), run / name)
+            else:
+                (run / name).write_bytes(damaged(rng, whole[name]))
+            before = (run / name).read_bytes()
+            try:
+                load = (load_checkpoint, run / name) if name == names[0] else (load_state, run)
+                ended[f"{name} {outcome(load[0], script, load[1])}"] += 1
+            except BaseException as error:
+                raise AssertionError(f"case {k}, a damaged {name}: {error!r}") from error
+            assert (run / name).read_bytes() == before and sorted(os.listdir(run)) == listing
+            assert os.listdir() == ["runs"], "unpickling ran code"
+    return ended
+
+
+def random_actions(rng, shape):
+    """Actions of the right shape that may hold NaN, infinities, zeros and huge numbers, or something else."""
+    actions = rng.standard_normal(shape) * 10.0 ** rng.integers(-320, 308)
+    special = rng.choice([np.nan, np.inf, -np.inf, 0.0, -0.0, 5e-324, 1.7e308], size=shape)
+    actions = np.where(rng.random(shape) < rng.choice([0.0, 0.1, 1.0]), special, actions)
+    others = [actions[..., None], actions[:-1], actions.astype(np.float32), actions.astype(complex), actions.tolist()]
+    others += [actions.astype(str), actions.astype(object), actions > 0, np.zeros(shape, dtype=int), None, "x", {}, 3]
+    with np.errstate(all="ignore"):
+        return actions if rng.random() < 0.6 else others[rng.integers(len(others))]
+
+
+def fuzz_actions(count, seed=0):
+    """Actions of every kind to every environment: a finite step, or ValueError with one line."""
+    rng, ended = np.random.default_rng(seed), Counter()
+    batches = [gym.make_vec(env_id, num_envs=5) for env_id in (*envs.PROBLEMS, *envs.ROCKETS)]
+    for batch in batches:
+        batch.reset(seed=0)
+    for _ in range(count):
+        batch = batches[rng.integers(len(batches))]
+        with np.errstate(over="ignore"):
+            actions = random_actions(rng, batch.action_space.shape)
+        try:
+            observations, rewards, *_ = batch.step(actions)
+            assert np.isfinite(observations).all() and np.isfinite(rewards).all(), actions
+            ended["works"] += 1
+        except ValueError as error:
+            assert "\n" not in str(error), (actions, error)
+            ended["refused"] += 1
+    return ended
+
+
+# --- soak -------------------------------------------------------------------------------------------------------------
+
+
+def resources():
+    """Resident memory in bytes and number of open files of this process (Linux)."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE"), len(os.listdir("/proc/self/fd"))
+
+
+def soak_in_child(pipe, argv):
+    """In a child: train in a temporary folder and send `resources` after every update."""
+    script = importlib.import_module("ppo_gtrxl_di")
+    log_update = script.log_update
+
+    def log_and_send(*inputs):
+        log_update(*inputs)
+        pipe.send(resources())
+
+    script.log_update = log_and_send
+    sys.stdout = open(os.devnull, "w")
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+        script.main(argv)
+
+
+def soak(updates):
+    """Train for so many tiny updates: resident memory (bytes) and open files after each."""
+    ours, theirs = PROCESSES.Pipe(duplex=False)
+    process = PROCESSES.Process(target=soak_in_child, args=(theirs, [*TINY, f"--total-updates={updates}"]))
+    process.start()
+    seen = [ours.recv() for _ in range(updates)]
+    process.join()
+    assert process.exitcode == 0
+    return np.array(seen)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--kills", type=int, default=50)
+    parser.add_argument("--fuzz", type=int, default=10_000)
+    parser.add_argument("--soak", type=int, default=2000)
+    parser.add_argument("--seed", type=int, default=0)
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    ended = kill_and_resume(args.kills, args.seed)
+    print(f"{args.kills} kills, each resumed run ended with the uninterrupted one's bits: {dict(ended)}", flush=True)
+    for fuzz in (fuzz_arguments, fuzz_checkpoints, fuzz_actions):
+        print(f"{fuzz.__name__}, {args.fuzz} cases: {dict(fuzz(args.fuzz, args.seed))}", flush=True)
+    memory, files = soak(args.soak).T
+    growth = memory[-1] / memory[min(99, len(memory) - 1)] - 1
+    print(f"{args.soak} updates: memory {growth:+.2%} after the first 100, open files {min(files)} to {max(files)}")
+
+
+if __name__ == "__main__":
+    main()
