@@ -11,21 +11,17 @@ Top to bottom: arguments, problem, Gated Transformer-XL, agent, PPO, checkpoints
 from __future__ import annotations
 
 import copy
-import io
 import json
 import math
 import signal
 import sys
 import time
-import zipfile
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import get_type_hints
 
 import gymnasium as gym
 import numpy as np
-import safetensors.torch
 import torch
 import torch.nn.functional as F
 from torch import nn
@@ -34,8 +30,8 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torch.utils.tensorboard import SummaryWriter
 
 import evaluate
-from arguments import check, fail, parse, refuse
 from envs import ROCKET, target_axes, target_orbit
+from runs import check, fail, gathered, join_processes, load_state, parse, process, refuse, save_run, total
 
 
 @dataclass
@@ -319,7 +315,7 @@ class Batch:
 
 @torch.no_grad()
 def rollout(agent, envs, reward_scale, memory_noise):
-    """One episode in each environment (Algorithm 1, lines 4-11): the Batch and the episodes' `final_info`."""
+    """One episode in each environment (Algorithm 1, lines 4-11): the Batch and all processes' `final_info`."""
     T, N, like = envs.episode_steps, envs.num_envs, agent.actor_logstd
     shapes = envs.single_observation_space.shape, envs.single_action_space.shape, (), (), (), ()
     batch = Batch(*(like.new_zeros(T, N, *shape) for shape in shapes), agent.new_memory(N, memory_noise))
@@ -338,7 +334,8 @@ def rollout(agent, envs, reward_scale, memory_noise):
         alive = alive & ~terminated  # an ended environment has started anew; only its first episode counts
         if not alive.any():
             break
-    return batch, episodes
+    everyone = gathered(episodes)
+    return batch, {key: np.concatenate([part[key] for part in everyone]) for key in episodes}
 
 
 def gae(rewards, values, alive, gamma, gae_lambda):
@@ -353,9 +350,13 @@ def gae(rewards, values, alive, gamma, gae_lambda):
 
 
 def ppo_loss(agent, batch, mb, args):
-    """-L_CLIP + c1 L_VF - c2 H over the living steps of the episodes `mb`; returns it and what is logged."""
+    """-L_CLIP + c1 L_VF - c2 H over the living steps of the episodes `mb`; returns it and what is logged.
+
+    The minibatch is that of all processes: the loss is this one's share of its mean, what is logged is the sum.
+    """
     alive, advantages = batch.alive[:, mb], batch.advantages[:, mb]
-    mean = lambda x: (x * alive).sum() / alive.sum()  # noqa: E731
+    steps = total(alive.sum())
+    mean = lambda x: (x * alive).sum() / steps  # noqa: E731
     hidden = agent.encode(batch.obs[:, mb].transpose(0, 1), batch.memory[:, mb]).transpose(0, 1)
     _, newlogprob, entropy, newvalue = agent.get_action_and_value(hidden, batch.actions[:, mb])
     logratio = newlogprob - batch.logprobs[:, mb]
@@ -369,7 +370,14 @@ def ppo_loss(agent, batch, mb, args):
     with torch.no_grad():  # http://joschu.net/blog/kl-approx.html
         losses |= {"old_approx_kl": mean(-logratio), "approx_kl": mean((ratio - 1) - logratio)}
         losses["clipfrac"] = mean(((ratio - 1.0).abs() > args.clip_coef).to(ratio.dtype))
-    return loss, {name: value.detach() for name, value in losses.items()}
+    return loss, dict(zip(losses, total(torch.stack([value.detach() for value in losses.values()]))))
+
+
+def moments(x, alive, dim):
+    """Mean and variance along dim of the living steps of every process."""
+    count = total(alive.sum(dim, keepdim=True)).clamp(min=1)
+    mean = total((x * alive).sum(dim, keepdim=True)) / count
+    return mean, total(((x - mean) ** 2 * alive).sum(dim, keepdim=True)) / count
 
 
 def prepare(batch, args):
@@ -381,17 +389,15 @@ def prepare(batch, args):
     alive, mean, std = batch.alive, 0.0, 1.0
     if args.return_norm == "time":
         target, _ = gae(batch.rewards, torch.zeros_like(batch.values), alive, args.gamma, 1.0)  # Monte-Carlo returns
-        count = alive.sum(dim=1, keepdim=True).clamp(min=1)
-        mean = (target * alive).sum(dim=1, keepdim=True) / count
-        variance = ((target - mean) ** 2 * alive).sum(dim=1, keepdim=True) / count
+        mean, variance = moments(target, alive, 1)
         std = (variance + 0.09 * variance.sqrt().mean() ** 2 + 1e-8).sqrt()  # some steps have next to no spread
-    values, valid = mean + std * batch.values, alive.bool()
+    values = mean + std * batch.values
     batch.advantages, returns = gae(batch.rewards, values, alive, args.gamma, args.gae_lambda)
     batch.returns = (target - mean) / std if args.return_norm == "time" else returns
     if args.norm_adv:
-        adv = batch.advantages[valid]
-        batch.advantages = (batch.advantages - adv.mean()) / (adv.std() + 1e-8)
-    return 1 - (returns - values)[valid].var() / returns[valid].var()
+        mean, variance = moments(batch.advantages, alive, (0, 1))
+        batch.advantages = (batch.advantages - mean) / (variance.sqrt() + 1e-8)
+    return 1 - (moments(returns - values, alive, (0, 1))[1] / moments(returns, alive, (0, 1))[1]).squeeze()
 
 
 def update(agent, average, optimizer, batch, args):
@@ -409,6 +415,8 @@ def update(agent, average, optimizer, batch, args):
             break
         optimizer.zero_grad()
         loss.backward()
+        for parameter in agent.parameters():
+            total(parameter.grad) if parameter.grad is not None else None
         gradient = nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
         for name, value in {**losses, "gradient norm": gradient}.items():
             if not value.isfinite():
@@ -460,7 +468,7 @@ def parse_args(argv):
     if args.resume is not None:
         if refused := typed - {"resume", "cuda", "num_threads"}:
             refuse(min(refused), "", "only --cuda and --num-threads may be given beside --resume")
-        saved = load_state(args.resume)
+        saved = load_state(args.resume, Args, ENV_IDS)
         args = Args(**{**saved["args"], **{name: getattr(args, name) for name in typed}})
     elif args.checkpoint is not None:
         saved = evaluate.read_checkpoint(args.checkpoint, POLICY)
@@ -484,7 +492,7 @@ def training_state(args, modules, envs, progress):
     """All that a bit-exact resume needs, copied, so that training can go on while it is kept."""
     modules = {name: module.state_dict() for name, module in modules.items()}
     rng = {"torch": torch.get_rng_state(), "envs": json.dumps(envs.np_random.bit_generator.state)}
-    rng["cuda"] = torch.cuda.get_rng_state_all()
+    rng = gathered({**rng, "cuda": torch.cuda.get_rng_state_all()})
     return copy.deepcopy({"args": {**asdict(args), "resume": None}, "progress": progress, "rng": rng, **modules})
 
 
@@ -493,38 +501,15 @@ def restore(state, run_dir, modules, envs):
     try:
         for name, module in modules.items():
             module.load_state_dict(state[name])
-        torch.set_rng_state(state["rng"]["torch"])
-        torch.cuda.set_rng_state_all(state["rng"]["cuda"][: torch.cuda.device_count()])
-        envs.np_random.bit_generator.state = json.loads(state["rng"]["envs"])
+        if len(state["rng"]) != process()[1]:
+            raise ValueError(f"it was trained by {len(state['rng'])} processes")
+        rng = state["rng"][process()[0]]
+        torch.set_rng_state(rng["torch"])
+        torch.cuda.set_rng_state_all(rng["cuda"][: torch.cuda.device_count()])
+        envs.np_random.bit_generator.state = json.loads(rng["envs"])
         return {name: state["progress"][name] for name in ("seed", "total_updates", "global_step", "wall_seconds")}
     except Exception as error:  # an edited file fails in many ways, all alike to the user
         fail(f"--resume {run_dir}: its training_state.pt does not fit its own args ({error}); it must be whole")
-
-
-def load_state(run_dir):
-    """The training state of a run folder; one line if there is none, or it is damaged or another script's."""
-    try:
-        if damaged := zipfile.ZipFile(path := Path(run_dir) / "training_state.pt").testzip():  # torch checks no CRC
-            raise ValueError(f"{damaged} is damaged")
-        state = torch.load(path, map_location="cpu", weights_only=True)
-        args, kinds = state["args"], get_type_hints(Args)
-        if args.keys() != kinds.keys() or args["env_id"] not in ENV_IDS:
-            raise ValueError("of another script")
-        if wrong := [name for name, kind in kinds.items() if not isinstance(args[name], kind)]:
-            raise ValueError(f"{wrong[0]} is {args[wrong[0]]!r}")
-    except Exception as error:  # a missing, damaged or foreign file fails in many ways, all alike to the user
-        fail(f"--resume {run_dir}: must hold a training_state.pt of {Path(__file__).name} ({error})")
-    return state
-
-
-def save_run(run_dir, state):
-    """Write the training state and, derived from it, the weights that evaluation uses; each whole or not at all."""
-    torch.save(state, buffer := io.BytesIO())
-    evaluate.write_bytes(run_dir / "training_state.pt", buffer.getbuffer())
-    metadata = {"env_id": state["args"]["env_id"], "args": json.dumps(state["args"]), **state["progress"]}
-    weights = {k.removeprefix("module."): v.cpu() for k, v in state["average"].items() if k != "n_averaged"}
-    data = safetensors.torch.save(weights, {key: str(value) for key, value in metadata.items()})
-    evaluate.write_bytes(run_dir / "agent.safetensors", data)
 
 
 # Shared: evaluation, training, main -----------------------------------------------------------------------------------
@@ -572,7 +557,8 @@ def train(args, modules, envs, writer, run_dir, progress):
     """Algorithm 1; returns the progress. Also what ends it early leaves the state after the last whole update."""
     agent, average, optimizer = modules.values()
     state, metrics = training_state(args, modules, envs, progress), {}
-    save = partial(save_run, run_dir) if args.save_model else lambda state: None
+    saves = args.save_model and run_dir is not None
+    save = partial(save_run, run_dir) if saves else lambda state: None
     save(state)
     try:
         for iteration in range(progress["total_updates"] + 1, args.total_updates + 1):
@@ -583,9 +569,11 @@ def train(args, modules, envs, writer, run_dir, progress):
             losses = update(*modules.values(), batch, now)
             end_update(now, agent, optimizer, episodes, losses["approx_kl"])
             progress = {**progress, "total_updates": iteration}
-            progress["global_step"] += int(batch.alive.sum())
+            progress["global_step"] += int(total(batch.alive.sum()))
             progress["wall_seconds"] += time.time() - start
             state = training_state(args, modules, envs, progress)
+            if process()[0] > 0:
+                continue  # the first process saves, evaluates and logs
             if iteration % SAVE_EVERY == 0 or iteration == args.total_updates:
                 save(state)
             if args.eval_every and iteration % args.eval_every == 0:
@@ -594,13 +582,15 @@ def train(args, modules, envs, writer, run_dir, progress):
             log_update(writer, args, progress, batch, episodes, losses, learning_rate, metrics)
     except (KeyboardInterrupt, FloatingPointError) as error:
         save(state)
-        writer.flush()
         if isinstance(error, FloatingPointError):
-            kept = f"; the last good checkpoint is {run_dir}/training_state.pt" if args.save_model else ""
+            kept = f"; the last good checkpoint is {run_dir}/training_state.pt" if saves else ""
             fail(f"update {iteration}: {error}, must be finite{kept}")
-        kept = f"go on with: python {Path(__file__).name} --resume {run_dir}" if args.save_model else "nothing saved"
-        print(f"stopped after update {state['progress']['total_updates']}; {kept}")
+        kept = f"go on with: python {Path(__file__).name} --resume {run_dir}" if saves else "nothing saved"
+        if process()[0] == 0:
+            print(f"stopped after update {state['progress']['total_updates']}; {kept}")
         raise
+    finally:
+        writer.flush() if writer else None
     return progress
 
 
@@ -611,6 +601,9 @@ def run(args, agent, envs, saved):
     progress = {"seed": args.seed, "total_updates": 0, "global_step": 0, "wall_seconds": 0.0}
     if args.resume is not None:
         progress = restore(saved, run_dir, modules, envs)
+    if process()[0] > 0:
+        train(args, modules, envs, None, None, progress)
+        return
     if args.track:
         import wandb
         names = {"project": args.wandb_project_name, "entity": args.wandb_entity, "name": run_dir.name}
@@ -659,9 +652,13 @@ def main(argv):
     torch.set_num_threads(args.num_threads or torch.get_num_threads())
     torch.manual_seed(args.seed)
     torch.backends.cudnn.deterministic = args.torch_deterministic
-    envs = gym.make_vec(args.env_id, num_envs=args.num_envs, **{name: getattr(args, name) for name in ENV_OPTIONS})
-    envs.reset(seed=args.seed)
+    rank, processes = join_processes(args.cuda)
+    share = args.num_envs // processes + (rank < args.num_envs % processes)
+    envs = gym.make_vec(args.env_id, num_envs=share, **{name: getattr(args, name) for name in ENV_OPTIONS})
+    envs.reset(seed=args.seed + 2**31 * rank)
     agent = make_agent(args, envs, saved)
+    if rank > 0:  # the same weights, other noise
+        torch.manual_seed(args.seed + 2**31 * rank)
     if args.eval_only:
         metrics, arrays = evaluate_agent(agent, args, envs, args.eval_seed, saved["progress"])
         evaluate.write(metrics, arrays, args.checkpoint, args.eval_json, args.eval_npz)

@@ -313,7 +313,7 @@ def test_advantages_are_normalised_over_living_steps(learner, norm_adv):
     run.update()
     np.testing.assert_allclose(run.batch.returns.numpy()[alive], (expected + values)[alive], atol=1e-9)
     living = expected[alive]
-    living = (living - living.mean()) / living.std(ddof=1) if norm_adv else living
+    living = (living - living.mean()) / living.std() if norm_adv else living
     np.testing.assert_allclose(run.batch.advantages.numpy()[alive], living, rtol=1e-6, atol=1e-9)
 
 

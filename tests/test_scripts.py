@@ -22,7 +22,7 @@ import safetensors.torch
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-import arguments
+import runs
 
 torch.set_num_threads(1)
 ROOT = Path(__file__).parent.parent
@@ -92,13 +92,13 @@ def imported(nodes):
 
 
 def test_imports_point_one_way():
-    """scripts -> evaluate -> baselines -> envs, scripts -> arguments; a script is imported by nothing."""
-    rank = {"arguments": 0, "envs": 0, "baselines": 1, "evaluate": 2, **{path.stem: 3 for path in SCRIPTS}}
+    """scripts -> runs -> evaluate -> baselines -> envs; a script is imported by nothing."""
+    rank = {"envs": 0, "baselines": 1, "evaluate": 2, "runs": 3, **{path.stem: 4 for path in SCRIPTS}}
     for path in ROOT.rglob("*.py"):
         if "tests" in path.parts or any(part.startswith(".") for part in path.relative_to(ROOT).parts):
             continue
         own = imported(ast.walk(ast.parse(path.read_text()))) & rank.keys()
-        assert all(rank[name] < min(rank.get(path.stem, 3), 3) for name in own), (path, own)
+        assert all(rank[name] < min(rank.get(path.stem, 4), 4) for name in own), (path, own)
 
 
 @pytest.mark.parametrize(
@@ -327,7 +327,7 @@ def test_eval_every_uses_starts_of_its_own(tmp_path, monkeypatch):
     monkeypatch.setattr(DI.evaluate, "evaluate", lambda *a, **k: [seeds.append(a[2]), evaluate(*a, **k)][1])
     DI.main([*TINY, "--total-updates=3", "--eval-every=2", "--eval-seed=5"])
     assert len(seeds) == 2 and seeds[1] == 5
-    assert seeds[0] > arguments.RANGES["eval_seed"][1]  # no --eval-seed reaches it
+    assert seeds[0] > runs.RANGES["eval_seed"][1]  # no --eval-seed reaches it
     assert [step for step, _ in scalars(run_folder())["eval/ratio_of_sums"]] == [200, 300]
 
 

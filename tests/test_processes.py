@@ -1,0 +1,160 @@
+"""Several processes (torchrun) against one: gradients, weights, statistics, a rank that dies, resume."""
+
+import copy
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import torch.distributed as dist
+import torch.multiprocessing as multiprocessing
+from conftest import UnevenEnvs
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+
+import ppo_gtrxl_di as script
+
+ROOT = Path(__file__).parent.parent
+LENGTHS = [6, 2, 5, 1, 6, 3, 4, 6]  # the first half flies 14 steps, the second 19: means over ranks would be wrong
+SIZES = {"embed_dim": 8, "num_heads": 2, "num_blocks": 1, "memory_length": 4, "mlp_dim": 8, "hidden_dim": 8}
+NETWORK = [f"--{name.replace('_', '-')}={value}" for name, value in SIZES.items()]
+
+
+def batch_of(envs, agent):
+    torch.manual_seed(1)
+    return script.rollout(agent, envs, 1.0, 0.1)
+
+
+def share(batch, episodes):
+    """The batch of some of its episodes; the memory's episodes are its second dimension, too."""
+    return script.Batch(*(getattr(batch, name)[:, episodes].clone() for name in list(vars(batch))[:7]))
+
+
+def learn(rank, world, folder, settings):
+    """One update of this rank's half of the episodes; saves what came of it."""
+    torch.set_num_threads(1)
+    if world > 1:
+        dist.init_process_group("gloo", init_method=f"file://{folder}/meet", rank=rank, world_size=world)
+    args = script.Args(**SIZES, num_minibatches=2, update_epochs=2, **settings)
+    envs = UnevenEnvs(LENGTHS)
+    torch.manual_seed(0)
+    agent = script.Agent(args, envs)
+    batch = torch.load(f"{folder}/batch.pt", weights_only=False)
+    half = len(LENGTHS) // 2
+    # minibatch k of one process is the union of the ranks' minibatches k
+    order = torch.arange(half) if world > 1 else torch.tensor([0, 1, 4, 5, 2, 3, 6, 7])
+    torch.randperm = lambda n, device=None: order
+    batch = share(batch, slice(rank * half, (rank + 1) * half)) if world > 1 else batch
+    average = AveragedModel(agent, multi_avg_fn=get_ema_multi_avg_fn(0.9))
+    optimizer = torch.optim.Adam(agent.parameters(), lr=1e-3, eps=1e-5)
+    gradients, step = [], optimizer.step
+
+    def record():
+        gradients.append({name: p.grad.clone() for name, p in agent.named_parameters() if p.grad is not None})
+        step()
+
+    optimizer.step = record
+    losses = script.update(agent, average, optimizer, batch, args)
+    saved = {"gradients": gradients, "weights": agent.state_dict(), "losses": losses, "advantages": batch.advantages}
+    torch.save({**saved, "alive": batch.alive, "returns": batch.returns}, f"{folder}/{world}_{rank}.pt")
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{}, {"return_norm": "time", "gamma": 1.0}, {"target_kl": 1e-3, "learning_rate": 0.01}],
+    ids=["plain", "return_norm", "kl_stop"],
+)
+def test_two_processes_learn_what_one_does(tmp_path, settings):
+    torch.manual_seed(0)
+    args, envs = script.Args(**SIZES), UnevenEnvs(LENGTHS)
+    torch.save(batch_of(envs, script.Agent(args, envs))[0], tmp_path / "batch.pt")
+    context = multiprocessing.get_context("forkserver")
+    for world in (1, 2):
+        ranks = [context.Process(target=learn, args=(rank, world, str(tmp_path), settings)) for rank in range(world)]
+        [process.start() for process in ranks]
+        [process.join(120) for process in ranks]
+        assert [process.exitcode for process in ranks] == [0] * world
+    one, first, second = (torch.load(tmp_path / f"{name}.pt") for name in ("1_0", "2_0", "2_1"))
+    assert len(one["gradients"]) == len(first["gradients"]) == len(second["gradients"])
+    assert len(one["gradients"]) == 4 if "target_kl" not in settings else 1 <= len(one["gradients"]) < 4
+    for gradient, *others in zip(one["gradients"], first["gradients"], second["gradients"]):
+        for other in others:
+            torch.testing.assert_close(other, gradient, rtol=0, atol=1e-6)
+    assert max(gradient.abs().max() for gradient in one["gradients"][0].values()) > 1e-3
+    for other in (first, second):
+        torch.testing.assert_close(other["weights"], one["weights"], rtol=0, atol=1e-5)
+        assert other["losses"] == pytest.approx(one["losses"], rel=1e-4, abs=1e-6)
+    for name in ("advantages", "returns"):
+        both = torch.cat([first[name], second[name]], dim=1)
+        torch.testing.assert_close(both[one["alive"] > 0], one[name][one["alive"] > 0], rtol=1e-5, atol=1e-6)
+
+
+# --- torchrun ---------------------------------------------------------------------------------------------------------
+
+
+def torchrun(folder, *argv, wait=True):
+    """Start the script in two processes."""
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    process = subprocess.Popen([*command, script.__file__, *argv], cwd=folder, env=environment, **streams)
+    if wait:
+        output, _ = process.communicate(timeout=120)
+        assert process.returncode == 0, output
+    return process
+
+
+def children(pid):
+    """The processes that a process started (Linux)."""
+    return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
+def test_torchrun_death_and_resume(tmp_path):
+    """A worker that is killed ends both within 60 s; resumed, the run has the bits of the uninterrupted one."""
+    argv = [*NETWORK, "--num-envs=5", "--num-minibatches=2", "--update-epochs=2", "--eval-starts=10"]
+    argv += ["--total-updates=40", "--eval-every=0"]
+    states = []
+    for name in ("whole", "killed"):
+        folder = tmp_path / name
+        folder.mkdir()
+        process = torchrun(folder, *argv, wait=name == "whole")
+        if name == "killed":
+            while process.poll() is None and not list(folder.glob("runs/*/agent.safetensors")):
+                time.sleep(0.02)
+            killed = time.time()
+            os.kill(children(process.pid)[-1], signal.SIGKILL)
+            output, _ = process.communicate(timeout=60)
+            assert process.returncode != 0 and time.time() - killed < 60, output
+            assert not list(folder.glob("runs/*/eval.json")), "it ended before it was killed"
+            torchrun(folder, f"--resume={next(folder.glob('runs/*'))}")
+        (run,) = (folder / "runs").iterdir()
+        assert len(list(run.glob("eval.json"))) == 1
+        states.append(torch.load(run / "training_state.pt", weights_only=True))
+    whole, resumed = states
+    assert whole["progress"]["global_step"] == resumed["progress"]["global_step"] == 40 * 5 * 50
+    for part in ("agent", "average"):
+        torch.testing.assert_close(resumed[part], whole[part], rtol=0, atol=0)
+    assert len(whole["rng"]) == 2 and not torch.equal(whole["rng"][0]["torch"], whole["rng"][1]["torch"])
+    alone = subprocess.run([sys.executable, script.__file__, f"--resume={run}"], capture_output=True, text=True)
+    assert alone.returncode == 1 and "it was trained by 2 processes" in alone.stderr
+
+
+def test_more_processes_than_environments(monkeypatch):
+    monkeypatch.setenv("WORLD_SIZE", "4")
+    with pytest.raises(SystemExit, match="--num-envs 3: must be at least the number of processes, 4"):
+        script.parse_args(["--num-envs=3"])
+    with pytest.raises(SystemExit, match=r"--num-minibatches 3: must be at most --num-envs 8 / 4 processes"):
+        script.parse_args(["--num-envs=8", "--num-minibatches=3"])
+    assert script.parse_args(["--num-envs=8"])[0].num_minibatches == 2
+
+
+def test_moments_are_those_of_the_living(monkeypatch):
+    x, alive = np.random.default_rng(0).normal(size=(2, 4, 6))
+    alive = (alive > 0).astype(float)
+    mean, variance = script.moments(torch.tensor(x), torch.tensor(alive), (0, 1))
+    living = copy.copy(x[alive > 0])
+    assert (mean.item(), variance.item()) == pytest.approx((living.mean(), living.var()))
