@@ -1,20 +1,41 @@
-"""Seconds of one rollout and of one PPO epoch at a script's default sizes, on one core.
+"""How fast an update is, against this machine's matrix products and against windows gathered per sample.
 
-    python benchmarks/update_speed.py [--script ppo_gtrxl_di] [--env-id DoubleIntegrator-v0] [--repeats 5]
+    python benchmarks/update_speed.py                      # all sizes, one core
+    python benchmarks/update_speed.py --sizes di rocket --repeats 5 --threads 2
+    python benchmarks/update_speed.py --growth results/update_speed.png
+
+Each size runs in a process of its own, so that its peak memory is its own. Printed are the seconds of a rollout and of
+a PPO epoch, the rollout's share of an update, the epoch's FLOP (`flop_of_epoch`, and what torch counts), their rate
+over that of the same matrix products alone, and the epoch of the straightforward implementation that the public
+PPO-Transformer-XL codes use: every sample with a copy of its own window, whose keys and values are projected again.
 """
 
 from __future__ import annotations
 
 import argparse
 import importlib
+import math
+import multiprocessing
+import resource
 import sys
 import time
+from collections import Counter
 from pathlib import Path
 
 import gymnasium as gym
 import torch
+from matplotlib.figure import Figure
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils.flop_counter import FlopCounterMode
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+PAPER = {"num_blocks": 6, "embed_dim": 384, "num_heads": 8, "memory_length": 256, "mlp_dim": 384, "hidden_dim": 384}
+PAPER |= {"update_epochs": 16, "num_envs": 8, "num_minibatches": 1}
+SIZES = {"di": ("ppo_gtrxl_di", {}), "vdp": ("ppo_gtrxl_vdp", {}), "rocket": ("ppo_gtrxl_rocket", {})}
+SIZES["table1"] = ("ppo_gtrxl_rocket", PAPER)
+GATHERED_SAMPLES = {"table1": 64}  # of a minibatch, where a whole one would need more memory than there is
+NO_STOP = {"target_kl": None, "target_kl_final": None, "lr_schedule": "linear"}  # every minibatch takes its step
 
 
 def median_seconds(function, repeats):
@@ -27,33 +48,215 @@ def median_seconds(function, repeats):
     return sorted(seconds[1:])[repeats // 2], result
 
 
+class Workbench:
+    """A script's agent, optimiser and environments at one size, with one epoch an update."""
+
+    def __init__(self, script, **changes):
+        self.script = importlib.import_module(script)
+        self.epochs = changes.get("update_epochs", self.script.Args().update_epochs)
+        self.args = self.script.Args(**{**changes, **NO_STOP, "update_epochs": 1})
+        torch.manual_seed(self.args.seed)
+        options = {name: getattr(self.args, name) for name in self.script.ENV_OPTIONS}
+        self.envs = gym.make_vec(self.args.env_id, num_envs=self.args.num_envs, **options)
+        self.envs.reset(seed=self.args.seed)
+        self.agent = self.script.make_agent(self.args, self.envs, None)
+        self.modules = self.script.make_modules(self.args, self.agent)
+        self.modules["optimizer"].param_groups[0]["lr"] = 0.0
+
+    def rollout(self):
+        return self.script.rollout(self.agent, self.envs, self.args.reward_scale, self.args.memory_noise)[0]
+
+    def epoch(self, batch):
+        return self.script.update(*self.modules.values(), batch, self.args)
+
+
+# --- FLOP -------------------------------------------------------------------------------------------------------------
+
+
+def flop_of_epoch(bench, batch):
+    """FLOP of the matrix products of one epoch, a multiplication and an addition each.
+
+    Per step and block: query and output d^2, key and value d^2 (also of the memory), the gates 4 d^2, the MLP 2 d m;
+    scores and values d (L + C), positions d (L + 1). Backward twice as much, but for the observation's gradient.
+    """
+    args, (T, N) = bench.args, batch.alive.shape
+    L, d, m, h = args.memory_length, args.embed_dim, args.mlp_dim, args.hidden_dim
+    chunks = math.ceil(T / max(L, 16))
+    C = math.ceil(T / chunks)
+    inputs, actions = bench.agent.encoder[0].in_features, batch.actions.shape[-1]
+    attention = chunks * C * d * (2 * (L + C) + L + 1)
+    block = T * (2 * d * d + 4 * d * d + 2 * d * m) + 2 * (L + T) * d * d + attention
+    heads = T * (2 * d * h + h * actions + h)
+    return 2 * N * (3 * (args.num_blocks * block + heads) + 2 * T * inputs * d)
+
+
+class Products(TorchDispatchMode):
+    """Counts the matrix products that run under it, by operation, shapes and strides."""
+
+    def __init__(self):
+        super().__init__()
+        self.seen = Counter()
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        if function.overloadpacket in (torch.ops.aten.mm, torch.ops.aten.addmm, torch.ops.aten.bmm):
+            tensors = [argument for argument in args if isinstance(argument, torch.Tensor)]
+            self.seen[function, tuple((tuple(x.shape), x.stride()) for x in tensors)] += 1
+        return function(*args, **(kwargs or {}))
+
+
+def random_operand(shape, stride):
+    """A random tensor of this layout; windows of an unfold overlap in memory."""
+    return torch.randn(1 + sum((n - 1) * step for n, step in zip(shape, stride))).as_strided(shape, stride)
+
+
+def seconds_of_products(call, repeats):
+    """Seconds that the matrix products of a call take alone, on random operands of the same shapes and strides."""
+    with Products() as products:
+        call()
+    seconds = 0.0
+    for (function, operands), count in products.seen.items():
+        tensors = [random_operand(*operand) for operand in operands]
+        seconds += count * median_seconds(lambda: function(*tensors), max(repeats, 5))[0]  # noqa: B023
+    return seconds
+
+
+# --- the straightforward implementation -------------------------------------------------------------------------------
+
+
+@torch.no_grad()
+def block_inputs(agent, obs, memory):
+    """What the memory slots hold, (blocks, N, L + T, d): the memory, then each block's inputs."""
+    x, slots = agent.encoder(agent_features(agent, obs)), []
+    for block, block_memory in zip(agent.blocks, memory):
+        slots.append(torch.cat([block_memory, x], dim=1))
+        x = block(x, block.attention(x, block_memory))
+    return torch.stack(slots)
+
+
+def agent_features(agent, obs):
+    return sys.modules[type(agent).__module__].features(agent, obs)
+
+
+def encode_gathered(agent, obs, windows):
+    """Samples one by one: obs (B, obs), windows (blocks, B, L, d) -> hidden (B, d). No gradient into the memory."""
+    x = agent.encoder(agent_features(agent, obs))
+    for block, window in zip(agent.blocks, windows):
+        attention, heads = block.attention, block.attention.num_heads
+        context = torch.cat([window, x[:, None]], dim=1)  # (B, L + 1, d)
+        q = attention.query(x).unflatten(-1, (heads, 1, -1)) / math.sqrt(attention.dk)  # (B, H, 1, dk)
+        k, v = (map_(context).unflatten(-1, (heads, -1)).transpose(1, 2) for map_ in (attention.key, attention.value))
+        scores = q @ (k + attention.R.flip(1)).transpose(-1, -2)  # (B, H, 1, L + 1)
+        x = block(x, attention.out((scores.softmax(dim=-1) @ v).flatten(1)))
+    return x
+
+
+def gathered_epoch(bench, batch, samples):
+    """Seconds of one epoch of shuffled samples with gathered windows; with `samples` only so many, scaled to all."""
+    agent, args, (T, N) = bench.agent, bench.args, batch.alive.shape
+    slots = block_inputs(agent, batch.obs.transpose(0, 1), batch.memory)
+    reach, order = torch.arange(args.memory_length), torch.randperm(T * N)
+    size = samples or math.ceil(T * N / args.num_minibatches)
+    taken, start = 0, time.perf_counter()
+    for chosen in order.split(size)[: 1 if samples else None]:
+        t, n = chosen // N, chosen % N
+        windows = slots[:, n[:, None], t[:, None] + reach]  # (blocks, B, L, d): steps t - L .. t - 1
+        hidden = encode_gathered(agent, batch.obs[t, n], windows)
+        _, newlogprob, entropy, newvalue = agent.get_action_and_value(hidden, batch.actions[t, n])
+        ratio, advantages = (newlogprob - batch.logprobs[t, n]).exp(), batch.advantages[t, n]
+        clipped = ratio.clamp(1 - args.clip_coef, 1 + args.clip_coef)
+        loss = torch.max(-advantages * ratio, -advantages * clipped).mean() - args.ent_coef * entropy.mean()
+        loss = loss + args.vf_coef * 0.5 * (newvalue - batch.returns[t, n]).square().mean()
+        bench.modules["optimizer"].zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
+        bench.modules["optimizer"].step()
+        taken += len(chosen)
+    return (time.perf_counter() - start) * T * N / taken
+
+
+# --- measurements -----------------------------------------------------------------------------------------------------
+
+
+def measure(size, threads, repeats, pipe=None, changes=None):
+    """All figures of one size."""
+    torch.set_num_threads(threads)
+    script, preset = SIZES[size]
+    bench = Workbench(script, **{**preset, **(changes or {})})
+    rollout, batch = median_seconds(bench.rollout, 1 if size == "table1" else repeats)
+    T, N = batch.alive.shape
+    bench.epoch(batch)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    epoch, _ = median_seconds(lambda: bench.epoch(batch), 1 if size == "table1" else repeats)
+    with FlopCounterMode(display=False) as counted:
+        bench.epoch(batch)
+    products = seconds_of_products(lambda: bench.epoch(batch), 1)
+    gathered, _ = median_seconds(lambda: gathered_epoch(bench, batch, GATHERED_SAMPLES.get(size)), 1)
+    flop, update = flop_of_epoch(bench, batch), rollout + bench.epochs * epoch
+    figures = {
+        "episodes x steps": f"{N} x {T}",
+        "rollout": f"{rollout:.3f} s",
+        "rollout step": f"{1e3 * rollout / T:.2f} ms",
+        "epoch": f"{epoch:.3f} s",
+        "update": f"{update:.2f} s of {bench.epochs} epochs",
+        "rollout's share": f"{rollout / update:.1%}",
+        "samples a second": f"{T * N / update:.0f}",
+        "FLOP of an epoch": f"{flop:.3e} by formula, {counted.get_total_flops():.3e} counted",
+        "FLOP/s": f"{flop / epoch / 1e9:.1f} G, {products / epoch:.2f} of the same products alone",
+        "gathered windows": f"{gathered:.2f} s an epoch, {gathered / epoch:.1f} times ours",
+        "peak memory": f"{peak:.0f} MB after a rollout and an update",
+    }
+    pipe.send(figures) if pipe else None
+    return figures
+
+
+def growth(path, repeats):
+    """Seconds of an epoch against T, L and N at the laptop rocket's width: a table, and a figure."""
+    import ppo_gtrxl_di as script
+
+    network = {"num_blocks": 2, "embed_dim": 64, "num_heads": 4, "mlp_dim": 64, "hidden_dim": 64, "num_minibatches": 1}
+    base = {"T": 480, "L": 32, "N": 16}
+    sweeps = {"T": [60, 120, 240, 480, 960], "L": [16, 32, 64, 128, 256], "N": [4, 8, 16, 32, 64]}
+    figure = Figure(figsize=(12, 3.6), layout="constrained")
+    for ax, (name, values) in zip(figure.subplots(1, 3), sweeps.items()):
+        seconds = []
+        for value in values:
+            T, L, N = {**base, name: value}.values()
+            bench = Workbench(script.__name__, **network, memory_length=L, num_envs=N)
+            steps = torch.randn(T, N)
+            obs, memory = torch.randn(T, N, 3), bench.agent.new_memory(N, 0.1)
+            batch = script.Batch(obs, steps[..., None], steps, steps, steps, torch.ones(T, N), memory)
+            seconds.append(median_seconds(lambda: bench.epoch(batch), repeats)[0])  # noqa: B023
+            print(f"T {T:4} L {L:3} N {N:3}: {seconds[-1]:.3f} s an epoch", flush=True)
+        ax.plot(values, seconds, "o-", color="tab:red", label="measured")
+        ax.plot(values, [seconds[-1] * value / values[-1] for value in values], ":", color="0.5", label="in proportion")
+        labels = {"T": "steps of an episode T", "L": "memory length L", "N": "episodes N"}
+        others = ", ".join(f"{key} = {value}" for key, value in base.items() if key != name)
+        ax.set(xlabel=f"{labels[name]} ({others})", ylabel="seconds of an epoch", xlim=(0, None), ylim=(0, None))
+        ax.grid(alpha=0.3)
+        ax.legend()
+    figure.savefig(path, dpi=130)
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--script", default="ppo_gtrxl_di")
-    parser.add_argument("--env-id", default=None)
-    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--sizes", nargs="+", choices=SIZES, default=["di", "rocket", "table1"])
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--growth", metavar="PNG", help="measure and draw the growth with T, L and N instead")
     options = parser.parse_args()
-    script = importlib.import_module(options.script)
-    args = script.Args()
-    args.env_id, args.target_kl = options.env_id or args.env_id, None
-    epochs, args.update_epochs = args.update_epochs, 1
-    torch.set_num_threads(1)
-    torch.manual_seed(args.seed)
-    env_options = {name: getattr(args, name) for name in script.ENV_OPTIONS}
-    envs = gym.make_vec(args.env_id, num_envs=args.num_envs, **env_options)
-    agent = script.Agent(args, envs)
-    average = script.AveragedModel(agent, multi_avg_fn=script.get_ema_multi_avg_fn(args.weight_average))
-    optimizer = torch.optim.Adam(agent.parameters(), lr=0.0, eps=1e-5, fused=True)
-    fly = lambda: script.rollout(agent, envs, args.reward_scale, args.memory_noise)  # noqa: E731
-    rollout_seconds, (batch, _) = median_seconds(fly, options.repeats)
-    learn = lambda: script.update(agent, average, optimizer, batch, args)  # noqa: E731
-    epoch_seconds, _ = median_seconds(learn, options.repeats)
-    update_seconds = rollout_seconds + epochs * epoch_seconds
-    print(f"{args.env_id}: {args.num_envs} episodes of {envs.episode_steps} steps, one core")
-    share = rollout_seconds / update_seconds
-    print(f"  rollout    {rollout_seconds:.3f} s, {share:.1%} of an update of {epochs} epochs")
-    print(f"  PPO epoch  {epoch_seconds:.3f} s")
-    print(f"  update     {update_seconds:.2f} s")
+    if options.growth:
+        torch.set_num_threads(options.threads)
+        return growth(options.growth, options.repeats)
+    spawn = multiprocessing.get_context("spawn")
+    for size in options.sizes:
+        ours, theirs = spawn.Pipe(duplex=False)
+        process = spawn.Process(target=measure, args=(size, options.threads, options.repeats, theirs))
+        process.start()
+        theirs.close()
+        print(f"{size}, {options.threads} thread(s)")
+        for name, value in ours.recv().items():
+            print(f"  {name:18} {value}", flush=True)
+        process.join()
 
 
 if __name__ == "__main__":
