@@ -42,6 +42,7 @@ class Args:
     torch_deterministic: bool = True  # if toggled, `torch.backends.cudnn.deterministic=True`
     cuda: bool = True  # if toggled, a GPU is used when there is one
     num_threads: int = 0  # CPU threads of torch (0: torch's own choice)
+    torch_compile: bool = False  # compile the network: a minute or more at the start, quicker updates after it
     track: bool = False  # if toggled, this experiment will be tracked with Weights and Biases
     wandb_project_name: str = "ppo-gtrxl"  # the wandb's project name
     wandb_entity: str | None = None  # the entity (team) of wandb's project
@@ -211,17 +212,19 @@ class RelativeAttention(nn.Module):
         return products.flatten(-2)[..., : C * (L + C)].unflatten(-1, (C, L + C))
 
     def start_cache(self, memory, steps):
-        """Keys and values of the memory (N, L, d), with room for `steps` more: (2, N, H, L + steps, dk)."""
+        """Keys and values of the memory (N, L, d) with room for `steps` more, (2, N, H, L + steps, dk); and what every
+        step uses: the three projections as one (3 d, d), and R in the order of the window's keys (H, L + 1, dk)."""
         kv = torch.stack([self.key(memory), self.value(memory)]).unflatten(-1, (self.num_heads, self.dk))
-        return F.pad(kv.transpose(2, 3), (0, 0, 0, steps))
+        projections = torch.cat([self.query.weight / math.sqrt(self.dk), self.key.weight, self.value.weight])
+        return F.pad(kv.transpose(2, 3), (0, 0, 0, steps)), projections, self.R.flip(1)
 
     def step(self, x, cache, t):
         """Step t alone: x (N, d) -> (N, d); writes its key and value into the cache, reads the window before it."""
-        L, heads = self.memory_length, (-1, self.num_heads, 1, self.dk)
-        q = self.query(x).view(heads) / math.sqrt(self.dk)  # (N, H, 1, dk)
-        cache[:, :, :, t + L : t + L + 1] = torch.stack([self.key(x).view(heads), self.value(x).view(heads)])
-        k, v = cache[:, :, :, t : t + L + 1]  # (N, H, L + 1, dk)
-        scores = q @ (k + self.R.flip(1)).transpose(-1, -2)  # (N, H, 1, L + 1)
+        (kv, projections, R), L = cache, self.memory_length
+        qkv = F.linear(x, projections).view(len(x), 3, self.num_heads, 1, self.dk).transpose(0, 1)
+        kv[:, :, :, t + L : t + L + 1] = qkv[1:]
+        k, v = kv[:, :, :, t : t + L + 1]  # (N, H, L + 1, dk)
+        scores = qkv[0] @ (k + R).transpose(-1, -2)  # (N, H, 1, L + 1)
         return self.out((scores.softmax(dim=-1) @ v).flatten(1))
 
 
@@ -598,6 +601,8 @@ def run(args, agent, envs, saved):
     """Train (or go on), save, evaluate, print the table."""
     run_dir = Path(args.resume or f"runs/{args.env_id}__{args.exp_name}__{args.seed}__{int(time.time())}")
     modules = make_modules(args, agent)
+    if args.torch_compile:
+        agent.encode, agent.encode_step = torch.compile(agent.encode), torch.compile(agent.encode_step)
     progress = {"seed": args.seed, "total_updates": 0, "global_step": 0, "wall_seconds": 0.0}
     if args.resume is not None:
         progress = restore(saved, run_dir, modules, envs)

@@ -159,7 +159,7 @@ def test_flags_of_the_interface():
     words += " vf_coef max_grad_norm target_kl total_updates num_blocks embed_dim num_heads memory_length mlp_dim"
     words += " hidden_dim learning_rate_final ent_coef_final reward_scale radius_curriculum weight_average log_std"
     words += " checkpoint resume eval_only eval_starts eval_seed eval_json eval_npz eval_every observe_phase"
-    words += " num_threads return_norm noise log_std_final gae_lambda_final"
+    words += " num_threads torch_compile return_norm noise log_std_final gae_lambda_final"
     fields = {s: {field.name for field in dataclasses.fields(s.Args)} for s in (DI, VDP, ROCKET)}
     assert all(set(words.split()) <= fields[script] | {"radius_curriculum"} for script in fields)
     rocket_only = {"action_frame", "guidance", "mass_weight"}
