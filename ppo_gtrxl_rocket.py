@@ -75,7 +75,7 @@ class Args:
     memory_noise: float = 0.1  # spread of the memory before an episode's start in training (Algorithm 1, line 5)
 
     # PPO
-    total_updates: int = 400  # number of updates
+    total_updates: int = 500  # number of updates
     num_envs: int = 32  # number of parallel environments, each flying one episode per update
     learning_rate: float = 3e-4  # learning rate of the first update
     learning_rate_final: float = 1e-5  # learning rate of the last update (linear in between); with kl the lowest
@@ -96,7 +96,7 @@ class Args:
     return_norm: str = "time"  # none, or time: the critic learns returns normalised over the episodes, step by step
     noise: str = "gated"  # who sets the log-std: learned, schedule (linear), gated (falls as the episodes succeed)
     log_std: float = -1.9  # initial log of the policy's standard deviation, in the action's unit
-    log_std_final: float = -3.9  # with schedule the last update's, with gated the lowest (--log-std: the highest)
+    log_std_final: float = -4.6  # with schedule the last update's, with gated the lowest (--log-std: the highest)
     noise_decay: float = 0.98  # gated: factor on the standard deviation after an update whose episodes succeed
     weight_average: float = 0.999  # decay of the averaged weights used in evaluation (0: off)
 
@@ -140,7 +140,7 @@ def set_curriculum(envs, args, progress):
 
 def noise_trend(episodes):
     """--noise gated: -1 lowers the noise (half of the sampled episodes end near the orbit), 1 raises it (far off)."""
-    return -1 if (error := np.median(episodes["error_norm"])) < 0.03 else int(error > 0.06)
+    return -1 if (error := np.median(episodes["error_norm"])) < 0.05 else int(error > 0.1)
 
 
 def describe(episodes, metrics):
