@@ -404,6 +404,11 @@ def test_rocket_draws_its_figures(rocket):
     assert {path.name for path in (rocket / "figures").iterdir()} == {"training.png", "trajectory.png", "orbit.png"}
 
 
+@pytest.mark.parametrize("errors, trend", [([0.04] * 6 + [9.0] * 5, -1), ([0.06] * 11, 0), ([0.01] * 5 + [0.2] * 6, 1)])
+def test_rockets_noise_follows_the_median_error(errors, trend):
+    assert ROCKET.noise_trend({"error_norm": np.array(errors)}) == trend
+
+
 def test_action_frame_comes_from_the_checkpoint(rocket, tmp_path, monkeypatch, refuses):
     checkpoint = rocket / "agent.safetensors"
     monkeypatch.chdir(tmp_path)
