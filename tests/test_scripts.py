@@ -442,20 +442,6 @@ def test_learning_rate_cannot_follow_a_limit_that_is_not_there(refuses):
     assert "--lr-schedule kl: needs --target-kl" in refuses("--target-kl", None, script=ROCKET)
 
 
-@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
-def test_update_speed_runs_with_every_script(script, monkeypatch, capsys):
-    """The benchmark calls `rollout` and `update` itself: with two short episodes in place of the defaults."""
-    speed = runpy.run_path(str(ROOT / "benchmarks" / "update_speed.py"))
-    module = importlib.import_module(script.stem)
-    tiny = {"num_envs": 2, "num_minibatches": 2, "num_blocks": 1, "embed_dim": 8, "num_heads": 2, "memory_length": 4}
-    defaults = module.Args
-    monkeypatch.setattr(module, "Args", lambda: defaults(**tiny))
-    monkeypatch.setattr(sys, "argv", ["update_speed.py", "--script", script.stem, "--repeats", "1"])
-    speed["main"]()
-    rollout, epoch, update = re.findall(r"(?:rollout|epoch|update) +([0-9.]+) s", capsys.readouterr().out)
-    assert float(rollout) > 0 and float(update) >= float(epoch) > 0
-
-
 # --- seeds and resume -------------------------------------------------------------------------------------------------
 
 

@@ -1,0 +1,46 @@
+"""`benchmarks/update_speed.py`: its FLOP formula against torch's counter, its gathered windows against the scripts."""
+
+import importlib
+import re
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+ROOT = Path(__file__).parent.parent
+TINY = {"num_envs": 3, "num_minibatches": 2, "num_blocks": 2, "embed_dim": 8, "num_heads": 2, "memory_length": 20}
+
+
+@pytest.fixture(scope="module")
+def speed():
+    sys.path.insert(0, str(ROOT / "benchmarks"))
+    yield importlib.import_module("update_speed")
+    sys.path.remove(str(ROOT / "benchmarks"))
+
+
+@pytest.mark.parametrize("size", ["di", "vdp", "rocket"])
+def test_every_script_is_measured(speed, size):
+    """With three episodes; the FLOP by formula are those that torch counts, but for the axes of the rocket's features."""
+    figures = speed.measure(size, 1, 1, changes=TINY)
+    formula, counted = re.findall(r"[0-9.]+e[+][0-9]+", figures["FLOP of an epoch"])
+    assert float(formula) == pytest.approx(float(counted), rel=0 if size != "rocket" else 0.02)
+    seconds = [float(re.match(r"[0-9.]+", figures[name])[0]) for name in ("rollout", "epoch", "update")]
+    assert seconds[0] > 0 and seconds[2] >= seconds[1] > 0
+    assert float(re.search(r"([0-9.]+) of the same", figures["FLOP/s"])[1]) < 1.1
+
+
+def test_gathered_windows_give_the_same_hidden_states(speed):
+    """Every sample with its own window, at the first steps, too, where the window is memory: 1e-5 in float32."""
+    bench = speed.Workbench("ppo_gtrxl_di", **TINY)
+    for block in bench.agent.blocks:
+        torch.nn.init.normal_(block.attention.R)  # zero at first, when the order in a window does not matter
+    batch = bench.rollout()
+    obs = batch.obs.transpose(0, 1)
+    hidden, slots = bench.agent.encode(obs, batch.memory), speed.block_inputs(bench.agent, obs, batch.memory)
+    n, t = torch.cartesian_prod(torch.arange(3), torch.arange(50)).T
+    windows = slots[:, n[:, None], t[:, None] + torch.arange(20)]
+    gathered = speed.encode_gathered(bench.agent, obs[n, t], windows)
+    torch.testing.assert_close(gathered, hidden[n, t], rtol=0, atol=1e-5)
+    wrong = speed.encode_gathered(bench.agent, obs[n, t], windows.roll(1, dims=2))
+    assert (wrong - hidden[n, t]).abs().max() > 1e-3
