@@ -21,7 +21,7 @@ def speed():
 
 @pytest.mark.parametrize("size", ["di", "vdp", "rocket"])
 def test_every_script_is_measured(speed, size):
-    """With three episodes; the FLOP by formula are those that torch counts, but for the axes of the rocket's features."""
+    """With three episodes; the FLOP by formula are those that torch counts (it leaves out the rocket's features)."""
     figures = speed.measure(size, 1, 1, changes=TINY)
     formula, counted = re.findall(r"[0-9.]+e[+][0-9]+", figures["FLOP of an epoch"])
     assert float(formula) == pytest.approx(float(counted), rel=0 if size != "rocket" else 0.02)
