@@ -696,8 +696,9 @@ def replacing(path, mode: str = "wb"):
         with open(temporary, mode, newline=None if "b" in mode else "") as file:
             yield file
         os.replace(temporary, path)
-    except OSError as error:  # of a full disk it would not say which file
-        raise OSError(error.errno, error.strerror, str(path)) from error
+    except OSError as error:
+        error.filename = error.filename or str(path)  # of a full disk it would not say which file
+        raise
     finally:
         temporary.unlink(missing_ok=True)
 

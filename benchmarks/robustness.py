@@ -197,6 +197,7 @@ def hostile_state(rng, state):
     """A training state with one entry of the wrong shape or type, missing, or code that unpickling would run."""
     state = pickle.loads(pickle.dumps(state))
     part = state[str(rng.choice(["args", "progress", "rng", "agent", "average", "optimizer"]))]
+    part = part[0] if isinstance(part, list) else part
     key = list(part)[rng.integers(len(part))]
     values = [RunsCode(), None, "x", -1, float("nan"), [], {}, torch.zeros(3), torch.zeros(8, 8)]
     part[key] = values[rng.integers(len(values))]

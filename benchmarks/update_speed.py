@@ -211,8 +211,7 @@ def measure(size, threads, repeats, pipe=None, changes=None):
 
 def growth(path, repeats):
     """Seconds of an epoch against T, L and N at the laptop rocket's width: a table, and a figure."""
-    import ppo_gtrxl_di as script
-
+    script = importlib.import_module("ppo_gtrxl_di")
     network = {"num_blocks": 2, "embed_dim": 64, "num_heads": 4, "mlp_dim": 64, "hidden_dim": 64, "num_minibatches": 1}
     base = {"T": 480, "L": 32, "N": 16}
     sweeps = {"T": [60, 120, 240, 480, 960], "L": [16, 32, 64, 128, 256], "N": [4, 8, 16, 32, 64]}
