@@ -697,7 +697,8 @@ def replacing(path, mode: str = "wb"):
             yield file
         os.replace(temporary, path)
     except OSError as error:
-        error.filename = error.filename or str(path)  # of a full disk it would not say which file
+        if error.errno and not error.filename:  # a full disk does not say which file
+            error.filename = str(path)
         raise
     finally:
         temporary.unlink(missing_ok=True)
