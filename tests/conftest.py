@@ -1,5 +1,9 @@
 """What several test files share: a vector environment whose episodes end at different times."""
 
+import os
+
+os.environ["OMP_NUM_THREADS"] = "1"  # two workers on two cores, and whatever they start
+
 import numpy as np
 import pytest
 from gymnasium.spaces import Box
