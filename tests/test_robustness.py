@@ -118,7 +118,7 @@ def test_flight_of_weights_that_overflow(robustness, tmp_path, monkeypatch, caps
 def test_soak(robustness):
     """After the first 100 of 300 tiny updates neither memory nor open files grow (benchmark: 2000)."""
     memory, files = robustness.soak(300).T
-    assert memory[-1] < 1.01 * memory[99] and files[-1] == files[99]
+    assert memory[-1] < 1.01 * memory[99] and max(files[100:]) <= max(files[:100])  # one more now and then: the writer
 
 
 @pytest.mark.parametrize("name", ["di", "rocket"])
