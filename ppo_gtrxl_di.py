@@ -30,7 +30,7 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torch.utils.tensorboard import SummaryWriter
 
 import evaluate
-from runs import check, fail, gathered, join_processes, load_state, parse, process, refuse, save_run, total
+from runs import check, fail, gathered, join_processes, keep_memory, load_state, parse, process, refuse, save_run, total
 
 
 @dataclass
@@ -172,10 +172,10 @@ class RelativeAttention(nn.Module):
     def forward(self, x, memory):
         """The whole segment at once: x (N, T, d), memory (N, L, d) -> (N, T, d).
 
-        Queries in chunks of C <= max(L, 16) steps, each against its own window of L + C keys: linear in T.
+        Queries in chunks of C <= max(L / 2, 64) steps, each against its own window of L + C keys: linear in T.
         """
         (N, T, d), L, H, dk = x.shape, self.memory_length, self.num_heads, self.dk
-        chunks = math.ceil(T / max(L, 16))
+        chunks = math.ceil(T / max(L // 2, 64))
         C = math.ceil(T / chunks)
         pad = (0, 0, 0, chunks * C - T)
         context = torch.cat([memory, x], dim=1)  # (N, L + T, d)
@@ -274,13 +274,15 @@ class Agent(nn.Module):
         """What evaluation flies: the policy without its noise."""
         return mean_action(self.actor(hidden), self.action_scale)
 
-    def get_action_and_value(self, hidden, action=None):
-        """Sample (or take) the action: its value, log-probability, the policy's entropy and the critic's output."""
-        logstd = self.actor_logstd.clamp(-5.0, 0.5)
+    def get_policy(self, hidden):
+        """The Gaussian that training samples from, of hidden (..., d): over actions (..., actions), in their unit."""
         mean = self.get_mean_action(hidden)
-        probs = Normal(mean, logstd.exp().expand_as(mean), validate_args=False)
-        action = probs.sample() if action is None else action
-        return action, probs.log_prob(action).sum(-1), probs.entropy().sum(-1), self.critic(hidden).squeeze(-1)
+        return Normal(mean, self.actor_logstd.clamp(-5.0, 0.5).exp().expand_as(mean), validate_args=False)
+
+    def evaluate_actions(self, hidden, actions):
+        """log pi(a|s), the policy's entropy and the critic's output, (...) each, of hidden (..., d), (..., actions)."""
+        probs = self.get_policy(hidden)
+        return probs.log_prob(actions).sum(-1), probs.entropy().sum(-1), self.critic(hidden).squeeze(-1)
 
 
 # Shared: PPO (Algorithm 1) --------------------------------------------------------------------------------------------
@@ -305,13 +307,13 @@ def rollout(agent, envs, reward_scale, memory_noise):
     T, N, like = envs.episode_steps, envs.num_envs, agent.actor_logstd
     shapes = envs.single_observation_space.shape, envs.single_action_space.shape, (), (), (), ()
     batch = Batch(*(like.new_zeros(T, N, *shape) for shape in shapes), agent.new_memory(N, memory_noise))
-    cache = agent.start_cache(batch.memory, T)
+    cache, hidden = agent.start_cache(batch.memory, T), like.new_zeros(T, N, agent.embed_dim)
     alive, episodes, (next_obs, _) = np.ones(N, dtype=bool), {}, envs.reset()
     batch.obs[:] = torch.as_tensor(next_obs)  # steps that nobody lives to are computed, too: they need a real state
     for t in range(T):
         batch.obs[t], batch.alive[t] = torch.as_tensor(next_obs), torch.as_tensor(alive)
-        hidden = agent.encode_step(batch.obs[t], cache, t)
-        batch.actions[t], batch.logprobs[t], _, batch.values[t] = agent.get_action_and_value(hidden)
+        hidden[t] = agent.encode_step(batch.obs[t], cache, t)
+        batch.actions[t] = agent.get_policy(hidden[t]).sample()
         next_obs, reward, terminated, _, info = envs.step(batch.actions[t].cpu().numpy())
         batch.rewards[t] = torch.as_tensor(reward * alive * reward_scale)
         ended = alive & terminated
@@ -320,6 +322,7 @@ def rollout(agent, envs, reward_scale, memory_noise):
         alive = alive & ~terminated  # an ended environment has started anew; only its first episode counts
         if not alive.any():
             break
+    batch.logprobs, _, batch.values = agent.evaluate_actions(hidden, batch.actions)
     everyone = gathered(episodes)
     return batch, {key: np.concatenate([part[key] for part in everyone]) for key in episodes}
 
@@ -344,7 +347,7 @@ def ppo_loss(agent, batch, mb, args):
     steps = total(alive.sum())
     mean = lambda x: (x * alive).sum() / steps  # noqa: E731
     hidden = agent.encode(batch.obs[:, mb].transpose(0, 1), batch.memory[:, mb]).transpose(0, 1)
-    _, newlogprob, entropy, newvalue = agent.get_action_and_value(hidden, batch.actions[:, mb])
+    newlogprob, entropy, newvalue = agent.evaluate_actions(hidden, batch.actions[:, mb])
     logratio = newlogprob - batch.logprobs[:, mb]
     ratio = logratio.exp()
     clipped = torch.clamp(ratio, 1 - args.clip_coef, 1 + args.clip_coef)
@@ -402,7 +405,8 @@ def update(agent, average, optimizer, batch, args):
         optimizer.zero_grad()
         loss.backward()
         for parameter in agent.parameters():
-            total(parameter.grad) if parameter.grad is not None else None
+            if parameter.grad is not None:
+                total(parameter.grad)
         gradient = nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
         for name, value in {**losses, "gradient norm": gradient}.items():
             if not value.isfinite():
@@ -414,13 +418,13 @@ def update(agent, average, optimizer, batch, args):
     return {name: value.item() for name, value in {**means, "explained_variance": explained_variance}.items()}
 
 
-def linear_schedule(first, last, iteration, total):
-    """`first` in iteration 1, `last` in iteration `total`, linear in between."""
-    return first + (last - first) * (iteration - 1) / max(total - 1, 1)
+def linear_schedule(first, last, iteration, iterations):
+    """`first` in iteration 1, `last` in iteration `iterations`, linear in between."""
+    return first + (last - first) * (iteration - 1) / max(iterations - 1, 1)
 
 
 def begin_update(args, agent, optimizer, envs, span):
-    """Set what follows a schedule; returns the arguments of this update. span: iteration, total."""
+    """Set what follows a schedule; returns the arguments of this update. span: iteration, iterations."""
     if args.lr_schedule == "linear":
         optimizer.param_groups[0]["lr"] = linear_schedule(args.learning_rate, args.learning_rate_final, *span)
     if args.noise == "schedule":
@@ -576,7 +580,8 @@ def train(args, modules, envs, writer, run_dir, progress):
             print(f"stopped after update {state['progress']['total_updates']}; {kept}")
         raise
     finally:
-        writer.flush() if writer else None
+        if writer:
+            writer.flush()
     return progress
 
 
@@ -594,6 +599,7 @@ def run(args, agent, envs, saved):
         return
     if args.track:
         import wandb
+
         names = {"project": args.wandb_project_name, "entity": args.wandb_entity, "name": run_dir.name}
         wandb.init(**names, sync_tensorboard=True, config=asdict(args), save_code=True)
     run_dir.mkdir(parents=True, exist_ok=args.resume is not None)
@@ -637,6 +643,7 @@ def interrupt(signum, _):
 
 def main(argv):
     args, saved = parse_args(argv)
+    keep_memory()
     torch.set_num_threads(args.num_threads or torch.get_num_threads())
     torch.manual_seed(args.seed)
     torch.backends.cudnn.deterministic = args.torch_deterministic

@@ -216,14 +216,13 @@ def test_policy_is_a_gaussian_in_the_actions_unit(uneven_envs, logstd, used):
     agent = make_agent(make_args(), uneven_envs([1], u_max=(4.0, 0.5)))
     torch.nn.init.constant_(agent.actor_logstd, logstd)
     hidden = torch.randn(2000, 8, dtype=torch.float64)
-    action, logprob, entropy, _ = agent.get_action_and_value(hidden)
+    action = agent.get_policy(hidden).sample()
+    logprob, entropy, _ = agent.evaluate_actions(hidden, action)
     mean, action, sigma = agent.get_mean_action(hidden).detach().numpy(), action.detach().numpy(), math.exp(used)
     np.testing.assert_allclose(mean, (agent.actor(hidden) * torch.tensor([4.0, 0.5])).detach().numpy())
     np.testing.assert_allclose(logprob.detach(), norm.logpdf(action, mean, sigma).sum(-1), atol=1e-9)
     np.testing.assert_allclose(entropy.detach(), 2 * (used + 0.5 * math.log(2 * math.pi * math.e)), atol=1e-12)
     np.testing.assert_allclose((action - mean).std(axis=0), sigma, rtol=0.05)
-    given = agent.get_action_and_value(hidden, torch.zeros(2000, 2, dtype=torch.float64))
-    np.testing.assert_allclose(given[1].detach(), norm.logpdf(0.0, mean, sigma).sum(-1), rtol=1e-9)
 
 
 # --- loss -------------------------------------------------------------------------------------------------------------
@@ -235,8 +234,8 @@ class PrescribedAgent:
     def encode(self, obs, memory):
         return obs
 
-    def get_action_and_value(self, hidden, action):
-        return action, hidden[..., 0], hidden[..., 1], hidden[..., 2]
+    def evaluate_actions(self, hidden, actions):
+        return hidden.unbind(-1)
 
 
 def hand_made_batch():
@@ -429,7 +428,7 @@ def test_one_step_bandit(uneven_envs):
 
     def best_action():
         hidden = run.agent.encode(run.batch.obs.transpose(0, 1), run.batch.memory)
-        logprob = run.agent.get_action_and_value(hidden, torch.ones(64, 1, 1, dtype=torch.float64))[1]
+        logprob = run.agent.evaluate_actions(hidden, torch.ones(64, 1, 1, dtype=torch.float64))[0]
         return logprob.mean().item(), run.agent.get_mean_action(hidden).mean().item()
 
     first_logprob, first_mean = best_action()
