@@ -2,6 +2,7 @@
 
     python benchmarks/update_speed.py                      # all sizes, one core
     python benchmarks/update_speed.py --sizes di rocket --repeats 5 --threads 2
+    python benchmarks/update_speed.py --compile            # what --torch-compile brings
     python benchmarks/update_speed.py --growth results/update_speed.png
 
 Each size runs in a process of its own, so that its peak memory is its own. Printed are the seconds of a rollout and of
@@ -16,10 +17,12 @@ import argparse
 import importlib
 import math
 import multiprocessing
+import re
 import resource
 import sys
 import time
 from collections import Counter
+from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
@@ -30,6 +33,8 @@ from torch.utils.flop_counter import FlopCounterMode
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from runs import keep_memory  # noqa: E402
+
 PAPER = {"num_blocks": 6, "embed_dim": 384, "num_heads": 8, "memory_length": 256, "mlp_dim": 384, "hidden_dim": 384}
 PAPER |= {"update_epochs": 16, "num_envs": 8, "num_minibatches": 1}
 SIZES = {"di": ("ppo_gtrxl_di", {}), "vdp": ("ppo_gtrxl_vdp", {}), "rocket": ("ppo_gtrxl_rocket", {})}
@@ -38,14 +43,22 @@ GATHERED_SAMPLES = {"table1": 64}  # of a minibatch, where a whole one would nee
 NO_STOP = {"target_kl": None, "target_kl_final": None, "lr_schedule": "linear"}  # every minibatch takes its step
 
 
+def timed(function):
+    """Wall-clock seconds of a call, and its result."""
+    start = time.perf_counter()
+    result = function()
+    return time.perf_counter() - start, result
+
+
+def median(values):
+    """The middle one, of an even number the higher of two."""
+    return sorted(values)[len(values) // 2]
+
+
 def median_seconds(function, repeats):
     """Median wall-clock seconds of `repeats` calls after one that is not counted, and the last call's result."""
-    seconds = []
-    for _ in range(repeats + 1):
-        start = time.perf_counter()
-        result = function()
-        seconds.append(time.perf_counter() - start)
-    return sorted(seconds[1:])[repeats // 2], result
+    seconds, results = zip(*(timed(function) for _ in range(repeats + 1)))
+    return median(seconds[1:]), results[-1]
 
 
 class Workbench:
@@ -81,7 +94,7 @@ def flop_of_epoch(bench, batch):
     """
     args, (T, N) = bench.args, batch.alive.shape
     L, d, m, h = args.memory_length, args.embed_dim, args.mlp_dim, args.hidden_dim
-    chunks = math.ceil(T / max(L, 16))
+    chunks = math.ceil(T / max(L // 2, 64))
     C = math.ceil(T / chunks)
     inputs, actions = bench.agent.encoder[0].in_features, batch.actions.shape[-1]
     attention = chunks * C * d * (2 * (L + C) + L + 1)
@@ -118,6 +131,28 @@ def seconds_of_products(call, repeats):
         tensors = [random_operand(*operand) for operand in operands]
         seconds += count * median_seconds(lambda: function(*tensors), max(repeats, 5))[0]  # noqa: B023
     return seconds
+
+
+# --- where the time goes ----------------------------------------------------------------------------------------------
+
+KINDS = {  # regular expressions for torch's names of operations
+    "products": "aten::(addmm|mm|bmm)",
+    "softmax": "aten::_softmax.*",
+    "gates, norms, GELU": "aten::(sigmoid.*|lerp|.*layer_norm.*|gelu.*)",
+    "copies": "aten::(copy_|cat|fill_|unfold_backward|index.*)",
+    "optimiser": ".*(Adam|_fused_adam_|aten::lerp_|vector_norm).*",
+}
+
+
+def shares(call):
+    """What part of the time of a call's operations each of KINDS takes; the rest is sums, views and dispatch."""
+    with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as profile:
+        call()
+    taken = Counter()
+    for row in profile.key_averages():
+        kind = next((kind for kind, names in KINDS.items() if re.fullmatch(names, row.key)), "rest")
+        taken[kind] += row.self_cpu_time_total
+    return {kind: taken[kind] / sum(taken.values()) for kind in [*KINDS, "rest"]}
 
 
 # --- the straightforward implementation -------------------------------------------------------------------------------
@@ -161,7 +196,7 @@ def gathered_epoch(bench, batch, samples):
         t, n = chosen // N, chosen % N
         windows = slots[:, n[:, None], t[:, None] + reach]  # (blocks, B, L, d): steps t - L .. t - 1
         hidden = encode_gathered(agent, batch.obs[t, n], windows)
-        _, newlogprob, entropy, newvalue = agent.get_action_and_value(hidden, batch.actions[t, n])
+        newlogprob, entropy, newvalue = agent.evaluate_actions(hidden, batch.actions[t, n])
         ratio, advantages = (newlogprob - batch.logprobs[t, n]).exp(), batch.advantages[t, n]
         clipped = ratio.clamp(1 - args.clip_coef, 1 + args.clip_coef)
         loss = torch.max(-advantages * ratio, -advantages * clipped).mean() - args.ent_coef * entropy.mean()
@@ -179,6 +214,7 @@ def gathered_epoch(bench, batch, samples):
 
 def measure(size, threads, repeats, pipe=None, changes=None):
     """All figures of one size."""
+    keep_memory()
     torch.set_num_threads(threads)
     script, preset = SIZES[size]
     bench = Workbench(script, **{**preset, **(changes or {})})
@@ -186,11 +222,14 @@ def measure(size, threads, repeats, pipe=None, changes=None):
     T, N = batch.alive.shape
     bench.epoch(batch)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    epoch, _ = median_seconds(lambda: bench.epoch(batch), 1 if size == "table1" else repeats)
+    samples, epochs, gathered = GATHERED_SAMPLES.get(size), [], []
+    for _ in range(repeats):  # by turns: another program on the machine slows both
+        epochs.append(timed(lambda: bench.epoch(batch))[0])
+        gathered.append(gathered_epoch(bench, batch, samples))
+    epoch, gathered = median(epochs), median(gathered)
     with FlopCounterMode(display=False) as counted:
         bench.epoch(batch)
     products = seconds_of_products(lambda: bench.epoch(batch), 1)
-    gathered, _ = median_seconds(lambda: gathered_epoch(bench, batch, GATHERED_SAMPLES.get(size)), 1)
     flop, update = flop_of_epoch(bench, batch), rollout + bench.epochs * epoch
     figures = {
         "episodes x steps": f"{N} x {T}",
@@ -202,11 +241,30 @@ def measure(size, threads, repeats, pipe=None, changes=None):
         "samples a second": f"{T * N / update:.0f}",
         "FLOP of an epoch": f"{flop:.3e} by formula, {counted.get_total_flops():.3e} counted",
         "FLOP/s": f"{flop / epoch / 1e9:.1f} G, {products / epoch:.2f} of the same products alone",
+        "shares": ", ".join(f"{kind} {share:.0%}" for kind, share in shares(lambda: bench.epoch(batch)).items()),
         "gathered windows": f"{gathered:.2f} s an epoch, {gathered / epoch:.1f} times ours",
         "peak memory": f"{peak:.0f} MB after a rollout and an update",
     }
     pipe.send(figures) if pipe else None
     return figures
+
+
+def compiled(size, threads, repeats, pipe):
+    """The rollout and the epoch as --torch-compile runs them, by turns with those that are not compiled."""
+    keep_memory()
+    torch.set_num_threads(threads)
+    script, preset = SIZES[size]
+    plain, quick = Workbench(script, **preset), Workbench(script, **preset)
+    batch = plain.rollout()
+    quick.agent.encode = torch.compile(quick.agent.encode)
+    quick.agent.encode_step = torch.compile(quick.agent.encode_step)
+    figures = {"compilation": f"{timed(quick.rollout)[0]:.0f} s and {timed(lambda: quick.epoch(batch))[0]:.0f} s"}
+    for name in ("rollout", "epoch"):
+        calls = {bench: partial(bench.epoch, batch) if name == "epoch" else bench.rollout for bench in (plain, quick)}
+        seconds = [[timed(call)[0] for call in calls.values()] for _ in range(repeats)]
+        before, after = (median(column) for column in zip(*seconds))
+        figures[name] = f"{before:.3f} s, compiled {after:.3f} s"
+    pipe.send(figures)
 
 
 def growth(path, repeats):
@@ -241,15 +299,17 @@ def main():
     parser.add_argument("--sizes", nargs="+", choices=SIZES, default=["di", "rocket", "table1"])
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--compile", action="store_true", help="measure --torch-compile instead")
     parser.add_argument("--growth", metavar="PNG", help="measure and draw the growth with T, L and N instead")
     options = parser.parse_args()
     if options.growth:
+        keep_memory()
         torch.set_num_threads(options.threads)
         return growth(options.growth, options.repeats)
-    spawn = multiprocessing.get_context("spawn")
+    spawn, function = multiprocessing.get_context("spawn"), compiled if options.compile else measure
     for size in options.sizes:
         ours, theirs = spawn.Pipe(duplex=False)
-        process = spawn.Process(target=measure, args=(size, options.threads, options.repeats, theirs))
+        process = spawn.Process(target=function, args=(size, options.threads, options.repeats, theirs))
         process.start()
         theirs.close()
         print(f"{size}, {options.threads} thread(s)")
