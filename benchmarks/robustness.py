@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import functools
 import importlib
+import inspect
 import io
 import json
 import multiprocessing
@@ -156,7 +158,8 @@ def random_arguments(rng, script):
 def fuzz_arguments(count, seed=0):
     """Random command lines through a script's parsing and checks, in an empty folder, which must stay empty."""
     rng, ended = np.random.default_rng(seed), Counter()
-    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+    read_once = mock.patch("inspect.getsource", functools.cache(inspect.getsource))  # tyro reads it for each line
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder), read_once:
         for _ in range(count):
             script = SCRIPTS[rng.integers(3)]
             argv = random_arguments(rng, script)

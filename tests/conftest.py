@@ -1,6 +1,9 @@
-"""What several test files share: a vector environment whose episodes end at different times."""
+"""What several test files share: a vector environment whose episodes end at different times, and a benchmark."""
 
+import importlib
 import os
+import sys
+from pathlib import Path
 
 os.environ["OMP_NUM_THREADS"] = "1"  # two workers on two cores, and whatever they start
 
@@ -47,3 +50,11 @@ class UnevenEnvs:
 @pytest.fixture
 def uneven_envs():
     return UnevenEnvs
+
+
+@pytest.fixture(scope="module")
+def robustness():
+    """The benchmark as a module that its child processes can import, too."""
+    sys.path.insert(0, folder := str(Path(__file__).parents[1] / "benchmarks"))
+    yield importlib.import_module("robustness")
+    sys.path.remove(folder)

@@ -1,4 +1,4 @@
-"""Kills, signals, full disks, damaged files, absurd flags and actions: nothing hurts a run, each gives one line.
+"""Kills, signals, a full disk, many updates, many environments: nothing hurts a run.
 
 `benchmarks/robustness.py` does the same more often.
 """
@@ -18,14 +18,6 @@ import torch
 
 ROOT = Path(__file__).parent.parent
 SCRIPT = ROOT / "ppo_gtrxl_di.py"
-
-
-@pytest.fixture(scope="module")
-def robustness():
-    """The benchmark as a module that its child processes can import, too."""
-    sys.path.insert(0, str(ROOT / "benchmarks"))
-    yield importlib.import_module("robustness")
-    sys.path.remove(str(ROOT / "benchmarks"))
 
 
 # --- kills and signals ------------------------------------------------------------------------------------------------
@@ -77,48 +69,17 @@ def test_full_disk_leaves_the_old_checkpoint(robustness, tmp_path):
     assert (run / "training_state.pt").read_bytes() == whole and not list(run.glob(".*.tmp"))
 
 
-# --- fuzzing ----------------------------------------------------------------------------------------------------------
-
-
-def test_thousand_command_lines(robustness):
-    ended = robustness.fuzz_arguments(1000)
-    assert sum(ended.values()) == 1000 and min(ended["works"], ended["refused"]) > 10, ended
-
-
-def test_thousand_damaged_files(robustness):
-    ended = robustness.fuzz_checkpoints(1000)
-    refused = ended["agent.safetensors refused"], ended["training_state.pt refused"]
-    assert sum(ended.values()) == 1000 and min(refused) > 100 and sum(refused) < 1000, ended
-
-
-def test_thousand_actions(robustness):
-    ended = robustness.fuzz_actions(1000)
-    assert sum(ended.values()) == 1000 and min(ended.values()) > 100, ended
-
-
-def test_flight_of_weights_that_overflow(robustness, tmp_path, monkeypatch, capsys):
-    """Finite weights whose action is not: the environment's one line, no traceback."""
-    monkeypatch.chdir(tmp_path)
-    script = robustness.SCRIPTS[0]
-    script.main([*robustness.TINY, "--total-updates=1"])
-    (run,) = Path("runs").iterdir()
-    state = torch.load(run / "training_state.pt", weights_only=True)
-    state["average"]["module.actor.2.weight"].fill_(3e38)
-    state["average"]["module.actor.0.bias"].fill_(3e38)
-    script.save_run(run, state)
-    command = [sys.executable, SCRIPT, "--eval-only", f"--checkpoint={run}/agent.safetensors", "--eval-starts=10"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60)
-    assert done.returncode == 1
-    assert re.fullmatch(r"error: action of env 0 at step 0 is \[(inf|nan|-inf)\]; it must be finite\n", done.stderr)
-
-
 # --- many updates, many environments ----------------------------------------------------------------------------------
 
 
 def test_soak(robustness):
-    """After the first 100 of 300 tiny updates neither memory nor open files grow (benchmark: 2000)."""
+    """After the first 100 of 300 tiny updates neither memory nor open files grow (benchmark: 2000).
+
+    TensorBoard's thread opens its file for each flush: the least of a hundred updates is what stays open.
+    """
     memory, files = robustness.soak(300).T
-    assert memory[-1] < 1.01 * memory[99] and max(files[100:]) <= max(files[:100])  # one more now and then: the writer
+    assert memory[-1] < 1.01 * memory[99]
+    assert len(set(files.reshape(3, 100).min(axis=1))) == 1, files
 
 
 @pytest.mark.parametrize("name", ["di", "rocket"])
@@ -130,3 +91,22 @@ def test_4096_environments(robustness, tmp_path, monkeypatch, name):
     (run,) = Path("runs").iterdir()
     steps = json.loads((run / "eval.json").read_text())["global_step"]
     assert 4096 < steps <= 4096 * 481
+
+
+def test_freed_memory_is_kept():
+    """A large tensor, freed and made again twenty times: its 24 414 pages come from the system a few times at most."""
+    code = """
+import resource, torch, runs
+torch.set_num_threads(1)
+def page_faults():
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(20):
+        torch.ones(25_000_000)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+print(page_faults(), runs.keep_memory(), page_faults(), page_faults())
+"""
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    given_back, *_, kept = done.stdout.split()
+    if int(given_back) < 20 * 24_000:
+        pytest.skip("this C library keeps it anyway")
+    assert int(kept) < 1000  # the second twenty: among the first some must find their place

@@ -1,0 +1,44 @@
+"""Damaged files, absurd flags and actions: each works or gives one line.
+
+`benchmarks/robustness.py` tries ten times as many.
+"""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import torch
+
+
+def test_thousand_command_lines(robustness):
+    ended = robustness.fuzz_arguments(1000)
+    assert sum(ended.values()) == 1000 and min(ended["works"], ended["refused"]) > 10, ended
+
+
+def test_thousand_damaged_files(robustness):
+    ended = robustness.fuzz_checkpoints(1000)
+    refused = ended["agent.safetensors refused"], ended["training_state.pt refused"]
+    assert sum(ended.values()) == 1000 and min(refused) > 100 and sum(refused) < 1000, ended
+
+
+def test_thousand_actions(robustness):
+    ended = robustness.fuzz_actions(1000)
+    assert sum(ended.values()) == 1000 and min(ended.values()) > 100, ended
+
+
+def test_flight_of_weights_that_overflow(robustness, tmp_path, monkeypatch, capsys):
+    """Finite weights whose action is not: the environment's one line, no traceback."""
+    monkeypatch.chdir(tmp_path)
+    script = robustness.SCRIPTS[0]
+    script.main([*robustness.TINY, "--total-updates=1"])
+    (run,) = Path("runs").iterdir()
+    state = torch.load(run / "training_state.pt", weights_only=True)
+    state["average"]["module.actor.2.weight"].fill_(3e38)
+    state["average"]["module.actor.0.bias"].fill_(3e38)
+    script.save_run(run, state)
+    flags = ["--eval-only", f"--checkpoint={run}/agent.safetensors", "--eval-starts=10"]
+    command = [sys.executable, script.__file__, *flags]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 1
+    assert re.fullmatch(r"error: action of env 0 at step 0 is \[(inf|nan|-inf)\]; it must be finite\n", done.stderr)
