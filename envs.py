@@ -660,7 +660,7 @@ class RocketVectorEnv(BatchedEnv):
     """N launches into a transfer orbit in four phases, steered by the thrust direction; 2 s steps, exact events.
 
     Observation: [r (3) m, v (3) m/s, m kg, t_norm, phi] in ECI, t_norm = 1 - t / 961 s, phi in {0, 1/3, 2/3, 1} the
-    phase at the step's start. Action: the thrust direction, any length but 0 (ValueError), normalised here; with
+    phase at the step's start. Action: the thrust direction, any length but 0 (BadInput), normalised here; with
     `action_frame="local"` by (up, along-track, cross-track of the target plane) at the step's start, then held in ECI.
     A step is one RK4 step between events: staging, a stage that runs dry (`table_isp`), the end of the episode.
 
@@ -765,7 +765,7 @@ class RocketVectorEnv(BatchedEnv):
         return obs
 
     def _directions(self, actions):
-        """Unit thrust directions in ECI (3, N) of actions (N, 3); ValueError names the first of length zero."""
+        """Unit thrust directions in ECI (3, N) of actions (N, 3); BadInput names the first of length zero."""
         largest = np.abs(actions).max(axis=1)
         if not largest.all():
             bad = int(np.argmin(largest))
