@@ -620,9 +620,13 @@ def penalties(altitude, time, turn, burnt, left, mass_weight):
     return -40.0 * crash - 0.024 * (overshoot + sag) - 0.001 * turn - mass_weight * (burnt + crash * left) / 100.0
 
 
-def terminal_reward(distance):
-    """R_terminal = -2 ln(1 + L_T / 0.01) at the episode's end, L_T as in R_orbital: steep near the target."""
-    return -2.0 * np.log1p(distance / 0.01)
+def terminal_reward(error_norm):
+    """R_terminal = -2 ln(1 + d / 0.005) at the episode's end, d the norm of the terminal error: steep near the target.
+
+    A norm, unlike R_orbital's sum: near the target the largest component is the one to work on, and the noise in the
+    others, which a sum of absolute values charges in full, hardly counts.
+    """
+    return -2.0 * np.log1p(error_norm / 0.005)
 
 
 def precision_points(error_norm):
@@ -865,7 +869,7 @@ class RocketVectorEnv(BatchedEnv):
             parts[2] = guidance_reward(u, *local_frame(before, self._axes[2])[:2], pitch, self.guidance_weight)
         left = np.minimum(self.y[6] - self._dry_mass, self._propellant)
         parts[3] = penalties(altitude, self.time, turn, burnt, left, self.mass_weight)
-        parts[4, done] = terminal_reward(distance[done])
+        parts[4, done] = terminal_reward(np.linalg.norm(terminal_error(self.y[:, done].T, self.rocket), axis=1))
         self._parts += parts
         self._distance, self._energy = distance, energy
         return parts.sum(axis=0)

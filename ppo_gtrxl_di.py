@@ -90,7 +90,7 @@ class Args:
     target_kl: float | None = None  # KL divergence from which an update takes no further step
     target_kl_final: float | None = None  # the same in the last update (linear in between; none: --target-kl)
     lr_schedule: str = "linear"  # linear, or kl: the learning rate follows half of --target-kl between its two ends
-    return_norm: str = "none"  # none, or time: the critic learns returns normalised over the episodes, step by step
+    return_norm: str = "none"  # none, time (the critic learns returns less their mean at a step), linear (less a fit)
     noise: str = "learned"  # who sets the log-std: learned, schedule (linear), gated (falls as the episodes succeed)
     log_std: float = 0.0  # initial log of the policy's standard deviation, in the action's unit
     log_std_final: float = -4.0  # with schedule the last update's, with gated the lowest (--log-std: the highest)
@@ -99,7 +99,6 @@ class Args:
 
 
 # Problem: what differs from the other scripts -------------------------------------------------------------------------
-
 ENV_IDS = ("DoubleIntegrator-v0", "DoubleIntegratorWaypoints-v0")
 ENV_OPTIONS = ("observe_phase",)  # arguments of the environments
 BUFFERS = {env_id: {"observation_scale": [1.0] * n} for env_id, n in zip(ENV_IDS, (3, 6))}  # all is of order one
@@ -122,7 +121,7 @@ def set_curriculum(envs, args, progress):
         envs.radius_scale = args.radius_curriculum ** max(0.0, 1 - progress / 0.6)
 
 
-def noise_trend(episodes):
+def noise_trend(episodes, std):
     """--noise gated: -1 lowers the noise (85 % of the sampled episodes hit every circle), 1 raises it (not half)."""
     hits = episodes["hit"].all(axis=1).mean()
     return -1 if hits >= 0.85 else int(hits < 0.5)
@@ -369,20 +368,31 @@ def moments(x, alive, dim):
     return mean, total(((x - mean) ** 2 * alive).sum(dim, keepdim=True)) / count
 
 
+def linear_fit(x, y, alive):
+    """y (T, N) as a linear function of x (T, N, k), fitted over the living episodes of each step: (T, N)."""
+    (x_mean, variance), (y_mean, _) = moments(x.double(), alive[..., None], 1), moments(y, alive, 1)
+    x, steps = (x - x_mean) / (variance.sqrt() + 1e-6) * alive[..., None], total(alive.sum(1)).clamp(min=1)
+    ridge = 0.01 * steps[:, None, None] * torch.eye(x.shape[-1]).to(x)  # what all episodes share has no slope
+    slope = torch.linalg.solve(total(x.mT @ x) + ridge, total(x.mT @ (y - y_mean).double()[..., None]))
+    return y_mean + (x @ slope)[..., 0].to(y.dtype)
+
+
 def prepare(batch, args):
     """Fill in advantages and the critic's targets (Algorithm 1, lines 12-13); returns the explained variance.
 
     --return-norm time: V(s, t) = mean_t + std_t critic(s), from these episodes' returns from step t on. They share the
-    clock, so most of a return is common to all; the critic is left with what differs between them.
+    clock, so most of a return is common to all; the critic is left with what differs between them. linear: mean_t is
+    their linear fit in the observation; near one path, that is half of what differs.
     """
     alive, mean, std = batch.alive, 0.0, 1.0
-    if args.return_norm == "time":
+    if args.return_norm != "none":
         target, _ = gae(batch.rewards, torch.zeros_like(batch.values), alive, args.gamma, 1.0)  # Monte-Carlo returns
-        mean, variance = moments(target, alive, 1)
+        mean = linear_fit(batch.obs, target, alive) if args.return_norm == "linear" else moments(target, alive, 1)[0]
+        variance = moments(target - mean, alive, 1)[1]
         std = (variance + 0.09 * variance.sqrt().mean() ** 2 + 1e-8).sqrt()  # some steps have next to no spread
     values = mean + std * batch.values
     batch.advantages, returns = gae(batch.rewards, values, alive, args.gamma, args.gae_lambda)
-    batch.returns = (target - mean) / std if args.return_norm == "time" else returns
+    batch.returns = returns if args.return_norm == "none" else (target - mean) / std
     if args.norm_adv:
         mean, variance = moments(batch.advantages, alive, (0, 1))
         batch.advantages = (batch.advantages - mean) / (variance.sqrt() + 1e-8)
@@ -404,9 +414,8 @@ def update(agent, average, optimizer, batch, args):
             break
         optimizer.zero_grad()
         loss.backward()
-        for parameter in agent.parameters():
-            if parameter.grad is not None:
-                total(parameter.grad)
+        for grad in [parameter.grad for parameter in agent.parameters() if parameter.grad is not None]:
+            total(grad)
         gradient = nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
         for name, value in {**losses, "gradient norm": gradient}.items():
             if not value.isfinite():
@@ -442,7 +451,7 @@ def end_update(args, agent, optimizer, episodes, approx_kl):
         factor = 1 / 1.3 if approx_kl > 0.75 * args.target_kl else 1.2 if approx_kl < args.target_kl / 3 else 1.0
         group["lr"] = min(max(group["lr"] * factor, args.learning_rate_final), args.learning_rate)
     if args.noise == "gated":
-        step = -math.log(args.noise_decay) * noise_trend(episodes)
+        step = -math.log(args.noise_decay) * noise_trend(episodes, agent.actor_logstd.exp().mean().item())
         agent.actor_logstd.add_(step).clamp_(args.log_std_final, args.log_std)
 
 

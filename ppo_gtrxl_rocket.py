@@ -93,16 +93,15 @@ class Args:
     target_kl: float | None = 0.02  # KL divergence from which an update takes no further step
     target_kl_final: float | None = 0.01  # the same in the last update (linear in between; none: --target-kl)
     lr_schedule: str = "kl"  # linear, or kl: the learning rate follows half of --target-kl between its two ends
-    return_norm: str = "time"  # none, or time: the critic learns returns normalised over the episodes, step by step
+    return_norm: str = "linear"  # none, time (the critic learns returns less their mean at a step), linear (less a fit)
     noise: str = "gated"  # who sets the log-std: learned, schedule (linear), gated (falls as the episodes succeed)
     log_std: float = -1.9  # initial log of the policy's standard deviation, in the action's unit
-    log_std_final: float = -4.6  # with schedule the last update's, with gated the lowest (--log-std: the highest)
+    log_std_final: float = -3.9  # with schedule the last update's, with gated the lowest (--log-std: the highest)
     noise_decay: float = 0.98  # gated: factor on the standard deviation after an update whose episodes succeed
-    weight_average: float = 0.999  # decay of the averaged weights used in evaluation (0: off)
+    weight_average: float = 0.99  # decay of the averaged weights used in evaluation (0: off)
 
 
 # Problem: what differs from the other scripts -------------------------------------------------------------------------
-
 ENV_IDS = ("RocketAscent-v0", "RocketAscentCutoff-v0")
 ENV_OPTIONS = ("observe_phase", "action_frame")  # arguments of the environments
 AXES, (H, E) = target_axes(), target_orbit()  # perigee, semi-latus, normal; angular momentum and eccentricity vector
@@ -138,9 +137,9 @@ def set_curriculum(envs, args, progress):
     envs.guidance, envs.mass_weight = args.guidance, envs.cutoff * args.mass_weight * max(0.0, 2 * progress - 1)
 
 
-def noise_trend(episodes):
-    """--noise gated: -1 lowers the noise (half of the sampled episodes end near the orbit), 1 raises it (far off)."""
-    return -1 if (error := np.median(episodes["error_norm"])) < 0.05 else int(error > 0.1)
+def noise_trend(episodes, std):
+    """--noise gated: -1 lowers the noise once it, not the mean action, makes the sampled episodes miss; 1 raises it."""
+    return -1 if (error := np.median(episodes["error_norm"])) < 0.2 * std else int(error > 0.5 * std)
 
 
 def describe(episodes, metrics):
@@ -386,20 +385,31 @@ def moments(x, alive, dim):
     return mean, total(((x - mean) ** 2 * alive).sum(dim, keepdim=True)) / count
 
 
+def linear_fit(x, y, alive):
+    """y (T, N) as a linear function of x (T, N, k), fitted over the living episodes of each step: (T, N)."""
+    (x_mean, variance), (y_mean, _) = moments(x.double(), alive[..., None], 1), moments(y, alive, 1)
+    x, steps = (x - x_mean) / (variance.sqrt() + 1e-6) * alive[..., None], total(alive.sum(1)).clamp(min=1)
+    ridge = 0.01 * steps[:, None, None] * torch.eye(x.shape[-1]).to(x)  # what all episodes share has no slope
+    slope = torch.linalg.solve(total(x.mT @ x) + ridge, total(x.mT @ (y - y_mean).double()[..., None]))
+    return y_mean + (x @ slope)[..., 0].to(y.dtype)
+
+
 def prepare(batch, args):
     """Fill in advantages and the critic's targets (Algorithm 1, lines 12-13); returns the explained variance.
 
     --return-norm time: V(s, t) = mean_t + std_t critic(s), from these episodes' returns from step t on. They share the
-    clock, so most of a return is common to all; the critic is left with what differs between them.
+    clock, so most of a return is common to all; the critic is left with what differs between them. linear: mean_t is
+    their linear fit in the observation; near one path, that is half of what differs.
     """
     alive, mean, std = batch.alive, 0.0, 1.0
-    if args.return_norm == "time":
+    if args.return_norm != "none":
         target, _ = gae(batch.rewards, torch.zeros_like(batch.values), alive, args.gamma, 1.0)  # Monte-Carlo returns
-        mean, variance = moments(target, alive, 1)
+        mean = linear_fit(batch.obs, target, alive) if args.return_norm == "linear" else moments(target, alive, 1)[0]
+        variance = moments(target - mean, alive, 1)[1]
         std = (variance + 0.09 * variance.sqrt().mean() ** 2 + 1e-8).sqrt()  # some steps have next to no spread
     values = mean + std * batch.values
     batch.advantages, returns = gae(batch.rewards, values, alive, args.gamma, args.gae_lambda)
-    batch.returns = (target - mean) / std if args.return_norm == "time" else returns
+    batch.returns = returns if args.return_norm == "none" else (target - mean) / std
     if args.norm_adv:
         mean, variance = moments(batch.advantages, alive, (0, 1))
         batch.advantages = (batch.advantages - mean) / (variance.sqrt() + 1e-8)
@@ -421,9 +431,8 @@ def update(agent, average, optimizer, batch, args):
             break
         optimizer.zero_grad()
         loss.backward()
-        for parameter in agent.parameters():
-            if parameter.grad is not None:
-                total(parameter.grad)
+        for grad in [parameter.grad for parameter in agent.parameters() if parameter.grad is not None]:
+            total(grad)
         gradient = nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
         for name, value in {**losses, "gradient norm": gradient}.items():
             if not value.isfinite():
@@ -459,7 +468,7 @@ def end_update(args, agent, optimizer, episodes, approx_kl):
         factor = 1 / 1.3 if approx_kl > 0.75 * args.target_kl else 1.2 if approx_kl < args.target_kl / 3 else 1.0
         group["lr"] = min(max(group["lr"] * factor, args.learning_rate_final), args.learning_rate)
     if args.noise == "gated":
-        step = -math.log(args.noise_decay) * noise_trend(episodes)
+        step = -math.log(args.noise_decay) * noise_trend(episodes, agent.actor_logstd.exp().mean().item())
         agent.actor_logstd.add_(step).clamp_(args.log_std_final, args.log_std)
 
 

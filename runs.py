@@ -40,7 +40,8 @@ RANGES = {  # lowest and highest value of every numeric flag; NaN and infinity a
     **{"eval_starts": (10, 10**6), "num_blocks": (1, 64), "memory_length": (0, 8192), "noise_decay": (0.1, 1.0)},
 }
 CHOICES = {"action_frame": ("local", "eci"), "guidance": ("none", "linear", "knots")}
-CHOICES |= {"lr_schedule": ("linear", "kl"), "return_norm": ("none", "time"), "noise": ("learned", "schedule", "gated")}
+CHOICES |= {"noise": ("learned", "schedule", "gated"), "return_norm": ("none", "time", "linear")}
+CHOICES |= {"lr_schedule": ("linear", "kl")}
 
 
 def fail(message):

@@ -201,8 +201,38 @@ def test_return_norm_time(learner):
     np.testing.assert_allclose(run.batch.advantages.numpy()[alive], expected[alive], rtol=1e-9, atol=1e-12)
 
 
-def test_return_norm_of_steps_that_no_episode_reached(uneven_envs):
-    run = Learner(uneven_envs([3, 2], spare_steps=2), return_norm="time")
+def test_return_norm_linear(learner):
+    """The fit by NumPy's least squares, ridge and all, over the episodes alive at a step; the rest is as with time."""
+    run = learner(return_norm="linear", gamma=0.9, gae_lambda=0.8, norm_adv=False)
+    lengths, critic, obs = run.envs.lengths, run.batch.values.numpy().copy(), run.batch.obs.numpy()
+    returns = monte_carlo(run.batch.rewards.numpy(), lengths, 0.9)
+    alive, fit = np.isfinite(returns), np.zeros(returns.shape)
+    for t, living in enumerate(alive):
+        x, y, k = obs[t, living], returns[t, living], obs.shape[-1]
+        x = (x - x.mean(axis=0)) / (x.std(axis=0) + 1e-6)
+        rows = np.vstack([x, np.sqrt(0.01 * len(y)) * np.eye(k)])
+        slope = np.linalg.lstsq(rows, np.concatenate([y - y.mean(), np.zeros(k)]))[0]
+        fit[t, living] = y.mean() + x @ slope
+    spread = np.nanstd(returns - fit, axis=1, keepdims=True)
+    std = np.sqrt(spread**2 + (0.3 * spread.mean()) ** 2 + 1e-8)
+    script.prepare(run.batch, run.args)
+    np.testing.assert_allclose(run.batch.returns.numpy()[alive], ((returns - fit) / std)[alive], rtol=1e-7)
+    expected = direct_gae(run.batch.rewards.numpy(), fit + std * critic, lengths, 0.9, 0.8)
+    np.testing.assert_allclose(run.batch.advantages.numpy()[alive], expected[alive], rtol=1e-7, atol=1e-9)
+
+
+def test_linear_fit_finds_a_line():
+    """float32 states of 1e6 with differences of 100, and a column without any: y is found again within a per cent."""
+    rng = np.random.default_rng(0)
+    x = np.stack([6e6 + 100 * rng.standard_normal((5, 64)), rng.standard_normal((5, 64)), np.ones((5, 64))], axis=-1)
+    y = 3.0 + 0.02 * (x[..., 0] - 6e6) - 4 * x[..., 1]
+    fit = script.linear_fit(*(torch.tensor(array, dtype=torch.float32) for array in (x, y, np.ones((5, 64)))))
+    assert fit.dtype == torch.float32 and np.abs(fit.numpy() - y).max() < 0.01 * np.ptp(y)
+
+
+@pytest.mark.parametrize("return_norm", ["time", "linear"])
+def test_return_norm_of_steps_that_no_episode_reached(uneven_envs, return_norm):
+    run = Learner(uneven_envs([3, 2], spare_steps=2), return_norm=return_norm)
     losses = run.update()
     assert np.isfinite(list(losses.values())).all() and run.batch.returns.isfinite().all()
 

@@ -65,7 +65,7 @@ def learn(rank, world, folder, settings):
 
 @pytest.mark.parametrize(
     "settings",
-    [{}, {"return_norm": "time", "gamma": 1.0}, {"target_kl": 1e-3, "learning_rate": 0.01}],
+    [{}, {"return_norm": "linear", "gamma": 1.0}, {"target_kl": 1e-3, "learning_rate": 0.01}],
     ids=["plain", "return_norm", "kl_stop"],
 )
 def test_two_processes_learn_what_one_does(tmp_path, settings):

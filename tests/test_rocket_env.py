@@ -744,10 +744,10 @@ def test_cut_off_row_of_a_batch_is_a_batch_of_one():
 # --- reward -----------------------------------------------------------------------------------------------------------
 
 
-def goal_distance(s):
+def goal_errors(s):
     h = np.cross(s[:3], s[3:6])
     e = np.cross(s[3:6], h) / MU - s[:3] / np.linalg.norm(s[:3])
-    return np.abs(PLANE.T @ h / GOAL_H - [0, 0, 1]).sum() + np.abs(PLANE.T @ e - [GOAL[1], 0, 0]).sum()
+    return np.concatenate([PLANE.T @ h / GOAL_H - [0, 0, 1], PLANE.T @ e - [GOAL[1], 0, 0]])
 
 
 def expected_parts(seen, u, final, mass_weight, trajectory_weight, guidance_weight, knots):
@@ -757,7 +757,7 @@ def expected_parts(seen, u, final, mass_weight, trajectory_weight, guidance_weig
         before, after, begin = seen[k], seen[k + 1], 2.0 * k
         end = final["final_time_s"] if k == len(u) - 1 else begin + 2
         altitude = np.linalg.norm(after[:3]) - RE
-        parts[k, 0] = 10 * (goal_distance(before) - goal_distance(after))
+        parts[k, 0] = 10 * (np.abs(goal_errors(before)).sum() - np.abs(goal_errors(after)).sum())
         if begin < 261:
             parts[k, 1] = trajectory_weight * (energy(after) - energy(before)) / 1e6
         if knots and begin <= 150.4:
@@ -775,7 +775,7 @@ def expected_parts(seen, u, final, mass_weight, trajectory_weight, guidance_weig
         if altitude < 0:
             parts[k, 3] -= mass_weight * min(after[6] - 6644, 16820) / 100
         if k == len(u) - 1:
-            parts[k, 4] = -2 * math.log(1 + goal_distance(after) / 0.01)
+            parts[k, 4] = -2 * math.log(1 + np.linalg.norm(goal_errors(after)) / 0.005)
     return parts
 
 
@@ -822,7 +822,8 @@ def test_rewards_follow_the_formulas(env_id, steering, weights, knots):
     np.testing.assert_allclose(got, parts.sum(axis=0), rtol=1e-10, atol=1e-10)
     assert final["episodic_return"] == pytest.approx(rewards.sum(), abs=1e-10)
     assert final["episodic_return"] == pytest.approx(sum(got), abs=1e-10)
-    assert final["R_orbital"] == pytest.approx(10 * (goal_distance(seen[0]) - goal_distance(seen[-1])), abs=1e-10)
+    first, last = (np.abs(goal_errors(seen[k])).sum() for k in (0, -1))
+    assert final["R_orbital"] == pytest.approx(10 * (first - last), abs=1e-10)
     if knots is None:
         assert final["R_guidance"] == final["R_trajectory"] == 0
     else:
@@ -880,7 +881,8 @@ def test_reward_functions_at_points_computed_by_hand():
     ]
     columns = [np.array(column) for column in zip(*(arguments for arguments, _ in hand))]
     np.testing.assert_allclose(penalties(*columns), [value for _, value in hand], rtol=0, atol=1e-15)
-    np.testing.assert_allclose(terminal_reward(np.array([0.0, 0.01, 0.99])), [0, -2 * math.log(2), -2 * math.log(100)])
+    logs = [0, -2 * math.log(2), -2 * math.log(100)]
+    np.testing.assert_allclose(terminal_reward(np.array([0.0, 0.005, 0.495])), logs)
     got = precision_points(np.array([0.0, 0.01, 0.02, 1.0]))
     expected = [5200, 2000 + 1600 * (math.exp(-1) + math.exp(-10)), 1600 * math.exp(-2), 0]
     np.testing.assert_allclose(got, expected, rtol=0, atol=1e-5)

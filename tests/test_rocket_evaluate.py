@@ -223,7 +223,7 @@ def test_reward_parts_equal_plain_loops(flown, env_id):
             penalty += 0.001 * norm([a - b for a, b in zip(u[k], u[k - 1])])
         step["R_penalties"] = -penalty
         if k == len(u) - 1:
-            step["R_terminal"] = -2 * math.log(1 + next_distance / 0.01)
+            step["R_terminal"] = -2 * math.log(1 + norm(errors(arrays["y"][k + 1])) / 0.005)
         assert reward == pytest.approx(sum(step.values()), abs=1e-8)
         for part, value in step.items():
             sums[part] += value

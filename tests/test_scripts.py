@@ -405,8 +405,10 @@ def test_rocket_draws_its_figures(rocket):
 
 
 @pytest.mark.parametrize("errors, trend", [([0.04] * 6 + [9.0] * 5, -1), ([0.06] * 11, 0), ([0.01] * 5 + [0.2] * 6, 1)])
-def test_rockets_noise_follows_the_median_error(errors, trend):
-    assert ROCKET.noise_trend({"error_norm": np.array(errors)}) == trend
+@pytest.mark.parametrize("std", [0.25, 0.01])
+def test_rockets_noise_follows_the_median_error(errors, trend, std):
+    """It falls below a fifth of the noise's standard deviation, and rises above a half of it."""
+    assert ROCKET.noise_trend({"error_norm": np.array(errors) * std / 0.25}, std) == trend
 
 
 def test_action_frame_comes_from_the_checkpoint(rocket, tmp_path, monkeypatch, refuses):
