@@ -96,7 +96,7 @@ class Args:
     return_norm: str = "linear"  # none, time (the critic learns returns less their mean at a step), linear (less a fit)
     noise: str = "gated"  # who sets the log-std: learned, schedule (linear), gated (falls as the episodes succeed)
     log_std: float = -1.9  # initial log of the policy's standard deviation, in the action's unit
-    log_std_final: float = -3.9  # with schedule the last update's, with gated the lowest (--log-std: the highest)
+    log_std_final: float = -4.6  # with schedule the last update's, with gated the lowest (--log-std: the highest)
     noise_decay: float = 0.98  # gated: factor on the standard deviation after an update whose episodes succeed
     weight_average: float = 0.99  # decay of the averaged weights used in evaluation (0: off)
 
