@@ -302,7 +302,6 @@ def test_missing_reference_is_asked_for_once_and_options_reach_the_environment(m
     assert np.abs(arrays["u"] - radial).max() < 1e-12
 
 
-@pytest.mark.skipif(not hasattr(evaluate.baselines, "rocket_reference"), reason="baselines.py has no rocket yet")
 def test_real_reference():
     """The optimum of `baselines` fits, and is one: it meets the orbit, and no flight by hand is heavier."""
     metrics, _ = evaluate.evaluate(CUTOFF, programme(BY_HAND), 0, 1, action_frame="local")
