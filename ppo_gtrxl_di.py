@@ -369,7 +369,7 @@ def moments(x, alive, dim):
 
 
 def linear_fit(x, y, alive):
-    """y (T, N) as a linear function of x (T, N, k), fitted over the living episodes of each step: (T, N)."""
+    """Ridge regression of y (T, N) on x (T, N, k) over the living episodes of each step: the fitted y, (T, N)."""
     (x_mean, variance), (y_mean, _) = moments(x.double(), alive[..., None], 1), moments(y, alive, 1)
     x, steps = (x - x_mean) / (variance.sqrt() + 1e-6) * alive[..., None], total(alive.sum(1)).clamp(min=1)
     ridge = 0.01 * steps[:, None, None] * torch.eye(x.shape[-1]).to(x)  # what all episodes share has no slope
