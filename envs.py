@@ -211,12 +211,17 @@ class PhasedVectorEnv(BatchedEnv):
     `final_info`: `episodic_return` (with the true radii), `cost`, `cost_state`, `cost_control`, `cost_terminal`, each
     (N,), and `hit` and `terminal_error` (the distance to the target at each phase's end), each (N, phases).
 
-    `observe_phase=False` shows tau and phi as 0. `radius_scale`, a scalar or one number a phase, enlarges the radii in
-    which the *reward* pays the bonus; 1 is the paper. `reset(options={"x0": (N, 2)})` sets the starts.
+    `observe_phase=False` shows tau and phi as 0. `reset(options={"x0": (N, 2)})` sets the starts.
+
+    Attributes that only training changes, to be set before a `reset`: `radius_scale`, a scalar or one number a phase,
+    enlarges the radii in which the *reward* pays the bonus (1 is the paper); with `flights_per_start` G environment k
+    flies start k // G, so that flights differ by their actions alone (1: each flies its own start; the last group is
+    smaller where G does not divide N).
     """
 
     def __init__(self, problem: Problem, num_envs: int = 1, observe_phase: bool = True):
-        self.problem, self.observe_phase, self.radius_scale = problem, observe_phase, 1.0
+        self.problem, self.observe_phase = problem, observe_phase
+        self.radius_scale, self.flights_per_start = 1.0, 1
         multi_phase = len(problem.phases) > 1
         target_max = np.max([np.abs(phase.target) for phase in problem.phases], axis=0)
         high = np.array([*problem.x_max, *target_max, 1.0, 1.0] if multi_phase else [*problem.x_max, 1.0])
@@ -255,7 +260,11 @@ class PhasedVectorEnv(BatchedEnv):
             if x0.shape != (self.num_envs, 2) or not np.isfinite(x0).all():
                 raise ValueError(f"options['x0'] must be finite, of shape ({self.num_envs}, 2); got {options['x0']!r}")
         else:
-            x0 = self.np_random.uniform(-bound, bound, (count, 2))
+            group = self.flights_per_start
+            if not (isinstance(group, int | np.integer) and group >= 1):
+                raise ValueError(f"flights_per_start is {group!r}; it must be a whole number of at least 1")
+            x0 = self.np_random.uniform(-bound, bound, (-(-count // group), 2))  # rounded up
+            x0 = np.repeat(x0, group, axis=0)[:count]
         for component, start in zip(self.x, x0.T):
             component[mask] = start
         self._running_cost[:, mask] = 0.0

@@ -371,6 +371,34 @@ def test_starts_follow_the_seed(env_id):
 
 
 @pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.parametrize("num_envs, group, groups", [(6, 1, 6), (6, 2, 3), (6, 6, 1), (7, 3, 3), (2, 5, 1)])
+def test_flights_per_start(env_id, num_envs, group, groups):
+    """Environment k flies start k // G: the draws of a smaller batch, each G times, at a reset and at the autoreset."""
+    envs, few = gym.make_vec(env_id, num_envs=num_envs), gym.make_vec(env_id, num_envs=groups)
+    envs.unwrapped.flights_per_start = group
+    rows = np.arange(num_envs) // group
+    actions = random_actions(env_id, num_envs)
+    seen, drawn = envs.reset(seed=3)[0], few.reset(seed=3)[0]
+    for _ in range(2):
+        np.testing.assert_array_equal(seen, drawn[rows])
+        assert len(np.unique(seen[:, 0])) == groups
+        for action in actions:
+            seen, drawn = envs.step(action)[0], few.step(action[:groups])[0]
+    np.testing.assert_array_equal(seen, drawn[rows])
+    start = np.random.default_rng(0).uniform(-1, 1, (num_envs, 2))
+    np.testing.assert_array_equal(envs.reset(options={"x0": start})[0][:, :2], start)
+
+
+@pytest.mark.parametrize("group", [0, -1, 1.5, math.nan, "2"])
+def test_bad_flights_per_start_are_refused(group):
+    envs = gym.make_vec("DoubleIntegrator-v0", num_envs=2)
+    assert envs.unwrapped.flights_per_start == 1
+    envs.unwrapped.flights_per_start = group
+    with pytest.raises(ValueError, match="flights_per_start is .*; it must be a whole number of at least 1"):
+        envs.reset()
+
+
+@pytest.mark.parametrize("env_id", IDS)
 def test_starts_outside_the_box_are_allowed(env_id):
     start = [[3.0, -2.0], [0.0, 5.0]]
     np.testing.assert_array_equal(gym.make_vec(env_id, num_envs=2).reset(options={"x0": start})[0][:, :2], start)
