@@ -629,13 +629,17 @@ def penalties(altitude, time, turn, burnt, left, mass_weight):
     return -40.0 * crash - 0.024 * (overshoot + sag) - 0.001 * turn - mass_weight * (burnt + crash * left) / 100.0
 
 
-def terminal_reward(error_norm):
-    """R_terminal = -2 ln(1 + d / 0.005) at the episode's end, d the norm of the terminal error: steep near the target.
+TERMINAL_SCALE = 0.005  # of the reported R_terminal
+
+
+def terminal_reward(error_norm, scale=TERMINAL_SCALE):
+    """R_terminal = -2 ln(1 + d / scale) at the episode's end, d the norm of the terminal error: steep near the target.
 
     A norm, unlike R_orbital's sum: near the target the largest component is the one to work on, and the noise in the
-    others, which a sum of absolute values charges in full, hardly counts.
+    others, which a sum of absolute values charges in full, hardly counts. Errors far below the scale earn almost the
+    same, so a scale that shrinks with the policy's noise is a curriculum of training.
     """
-    return -2.0 * np.log1p(error_norm / 0.005)
+    return -2.0 * np.log1p(error_norm / scale)
 
 
 def precision_points(error_norm):
@@ -686,7 +690,8 @@ class RocketVectorEnv(BatchedEnv):
     paper's `points`, `crashed`.
 
     Attributes that only training changes, to be set before a `reset`: `mass_weight`, `trajectory_weight`,
-    `guidance_weight`, `guidance` (a key of `REFERENCE_PITCH`) and `end_time` (s, at most the last phase's end).
+    `guidance_weight`, `guidance` (a key of `REFERENCE_PITCH`), `end_time` (s, at most the last phase's end) and
+    `terminal_scale`, a curriculum: the *reward* pays R_terminal with it, `final_info` reports it with `TERMINAL_SCALE`.
     """
 
     PARTS = ("R_orbital", "R_trajectory", "R_guidance", "R_penalties", "R_terminal")
@@ -710,6 +715,7 @@ class RocketVectorEnv(BatchedEnv):
         )
         self.cutoff, self.action_frame, self.observe_phase = cutoff, action_frame, observe_phase
         self.mass_weight, self.trajectory_weight, self.guidance_weight, self.guidance = 0.0, 0.0, 0.1, "none"
+        self.terminal_scale = TERMINAL_SCALE
         x0 = self.rocket.x0
         # |v| stays below the launcher's delta-v and 961 s of gravity, and |r| below what that speed reaches
         high = np.array([*[4e7] * 3, *[3e4] * 3, x0[-1], 1.0, 1.0])
@@ -760,6 +766,8 @@ class RocketVectorEnv(BatchedEnv):
             raise ValueError(f"reset options are {options!r}; a rocket has one start and no options")
         if self.guidance not in REFERENCE_PITCH:
             raise ValueError(f"guidance is {self.guidance!r}; it must be one of {', '.join(REFERENCE_PITCH)}")
+        if not 0 < self.terminal_scale < np.inf:
+            raise ValueError(f"terminal_scale is {self.terminal_scale}; it must be positive and finite")
         self.y[:, mask] = self.rocket.x0[:, None]
         self._parts[:, mask] = self.u[:, mask] = 0.0
         self._max_altitude[mask] = self.time[mask] = 0.0
@@ -865,7 +873,8 @@ class RocketVectorEnv(BatchedEnv):
         return y, time
 
     def _reward(self, before, u, altitude, done):
-        """The five parts of this step, added to their sums; returns their total, (N,)."""
+        """The five parts of this step, added to their sums; returns what is paid, (N,): their total, R_terminal with
+        `terminal_scale`."""
         t, phase = self.t, self._phase[self.t]
         distance, energy = self._progress()
         turn = np.sqrt(((u - self.u) ** 2).sum(axis=0)) * (t > 0)
@@ -878,8 +887,11 @@ class RocketVectorEnv(BatchedEnv):
             parts[2] = guidance_reward(u, *local_frame(before, self._axes[2])[:2], pitch, self.guidance_weight)
         left = np.minimum(self.y[6] - self._dry_mass, self._propellant)
         parts[3] = penalties(altitude, self.time, turn, burnt, left, self.mass_weight)
-        parts[4, done] = terminal_reward(np.linalg.norm(terminal_error(self.y[:, done].T, self.rocket), axis=1))
         self._parts += parts
+        if done.any():
+            error_norm = np.linalg.norm(terminal_error(self.y[:, done].T, self.rocket), axis=1)
+            self._parts[4, done] += terminal_reward(error_norm)
+            parts[4, done] = terminal_reward(error_norm, self.terminal_scale)
         self._distance, self._energy = distance, energy
         return parts.sum(axis=0)
 
@@ -902,6 +914,7 @@ class RocketEnv(SingleEnv):
     guidance_weight = of_batch("guidance_weight", "Weight of R_guidance.")
     guidance = of_batch("guidance", "The reference pitch of R_guidance, a key of REFERENCE_PITCH.")
     end_time = of_batch("end_time", "Seconds after which an episode ends at the latest.")
+    terminal_scale = of_batch("terminal_scale", "The scale of R_terminal in the reward; reports keep TERMINAL_SCALE.")
 
 
 def make_rocket_vector(num_envs: int = 1, **options) -> RocketVectorEnv:

@@ -883,6 +883,7 @@ def test_reward_functions_at_points_computed_by_hand():
     np.testing.assert_allclose(penalties(*columns), [value for _, value in hand], rtol=0, atol=1e-15)
     logs = [0, -2 * math.log(2), -2 * math.log(100)]
     np.testing.assert_allclose(terminal_reward(np.array([0.0, 0.005, 0.495])), logs)
+    np.testing.assert_allclose(terminal_reward(np.array([0.0, 0.001, 0.099]), 0.001), logs)
     got = precision_points(np.array([0.0, 0.01, 0.02, 1.0]))
     expected = [5200, 2000 + 1600 * (math.exp(-1) + math.exp(-10)), 1600 * math.exp(-2), 0]
     np.testing.assert_allclose(got, expected, rtol=0, atol=1e-5)
@@ -913,6 +914,50 @@ def test_weights_of_the_single_environment():
         for part in PARTS:
             affected = {"mass_weight": "R_penalties", "trajectory_weight": "R_trajectory"}.get(changed, "R_guidance")
             assert (final[part] == plain[part]) == (part != affected), (changed, part)
+
+
+@pytest.mark.parametrize("env_id, steering", [(FIXED, "early crash"), (CUTOFF, "ascent")])
+def test_terminal_scale_changes_only_the_last_reward(env_id, steering):
+    pay, finals = [], []
+    for scale in (0.005, 0.0005, 0.02):
+        envs = make(env_id, action_frame="local")
+        assert envs.unwrapped.terminal_scale == 0.005
+        envs.unwrapped.terminal_scale = scale
+        _, rewards, final = fly(envs, STEERING[steering])
+        pay.append(rewards)
+        finals.append(final)
+    d = finals[0]["error_norm"]
+    assert finals[0]["R_terminal"] == pytest.approx(-2 * math.log(1 + d / 0.005))
+    for rewards, final, scale in zip(pay, finals, (0.005, 0.0005, 0.02)):
+        np.testing.assert_array_equal(rewards[:-1], pay[0][:-1])
+        paid = rewards[-1] - pay[0][-1]
+        assert paid == pytest.approx(2 * math.log(1 + d / 0.005) - 2 * math.log(1 + d / scale), abs=1e-10)
+        for key, value in final.items():
+            np.testing.assert_array_equal(value, finals[0][key])
+
+
+def test_terminal_scale_in_a_batch_that_ends_at_different_times():
+    """Each environment is paid at its own end, by the scale that is set then."""
+    envs, plain = make(FIXED, 2), make(FIXED, 2)
+    envs.unwrapped.terminal_scale = 0.05
+    envs.reset(), plain.reset()
+    outward = plain.unwrapped.rocket.x0[:3]
+    differ, ended = [], []
+    for t in range(481):
+        action = np.array([outward, -outward if t < 30 else outward])  # the second falls back and crashes
+        differ.append(envs.step(action)[1] - plain.step(action)[1])
+        ended.append(plain.unwrapped.t == 0)
+    np.testing.assert_array_equal(np.array(differ) > 0, ended)
+    assert ended[-1][0] and sum(row[0] for row in ended) == 1 and sum(row[1] for row in ended) >= 1
+
+
+@pytest.mark.parametrize("maker", [make, single])
+@pytest.mark.parametrize("scale", [0.0, -0.005, math.nan, math.inf])
+def test_bad_terminal_scales_are_refused(maker, scale):
+    env = maker(FIXED)
+    env.unwrapped.terminal_scale = scale
+    with pytest.raises(ValueError, match=f"terminal_scale is {scale}; it must be positive and finite"):
+        env.reset()
 
 
 # --- end time ---------------------------------------------------------------------------------------------------------
