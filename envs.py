@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
@@ -311,25 +312,34 @@ class PhasedVectorEnv(BatchedEnv):
 
 
 class SingleEnv(gym.Env):
-    """One environment: a thin view of a batch of one (`batch`), without its autoreset."""
+    """One environment: a thin view of a batch of one (`batch`), without its autoreset.
+
+    A step without a reset before it, also the one after an episode's end, raises `gymnasium.error.ResetNeeded`.
+    """
 
     metadata = {"render_modes": []}
 
     def __init__(self, batch: BatchedEnv):
         self.batch = batch
+        self._running = False  # from a reset to the end of its episode
         self.observation_space, self.action_space = batch.single_observation_space, batch.single_action_space
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
         """Start anew, `options={"x0": (2,)}` from a given state; returns the observation and an empty info."""
         super().reset(seed=seed)
+        self._running = False  # also where the options are refused
         if options and "x0" in options:
             options = {**options, "x0": np.asarray(options["x0"])[None]}
         obs, info = self.batch.reset(seed=seed, options=options)
+        self._running = True
         return obs[0], info
 
     def step(self, action):
         """Fly one step; the last one's info holds what `final_info` holds in the batch."""
+        if not self._running:
+            raise ResetNeeded("no episode is running: call reset() first, and again after an episode has ended")
         obs, rewards, terminated, final = self.batch.advance(np.asarray(action)[None])
+        self._running = not terminated[0]
         return obs[0], float(rewards[0]), bool(terminated[0]), False, {key: value[0] for key, value in final.items()}
 
 

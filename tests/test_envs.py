@@ -6,6 +6,7 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 from scipy.integrate import solve_ivp
@@ -292,6 +293,29 @@ def test_single_environment_is_the_vector_environment(env_id):
             for key, value in single_info.items():
                 np.testing.assert_array_equal(value, info["final_info"][key][n])
     assert terminated.all() and not truncated.any()
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_steps_outside_an_episode_are_refused(env_id):
+    """Before the first reset, after the end, after a refused reset; a refused action ends nothing."""
+    env = gym.make(env_id, disable_env_checker=True).unwrapped  # Gymnasium's wrapper refuses the first step by itself
+    action = np.zeros(1)
+    with pytest.raises(ResetNeeded, match=r"call reset\(\) first"):
+        env.step(action)
+    for _ in range(2):
+        env.reset()
+        for t in range(horizon(env_id)):
+            with pytest.raises(ValueError, match="must be finite"):
+                env.step([math.nan])
+            assert env.step(action)[2] == (t == horizon(env_id) - 1)
+        for _ in range(2):
+            with pytest.raises(ResetNeeded, match="again after an episode has ended"):
+                env.step(action)
+    env.reset()
+    with pytest.raises(ValueError, match="x0"):
+        env.reset(options={"x0": [math.nan, 0.0]})
+    with pytest.raises(ResetNeeded):
+        env.step(action)
 
 
 @pytest.mark.parametrize("env_id", IDS)

@@ -11,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import spiceypy
+from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 from scipy.integrate import solve_ivp
@@ -693,6 +694,32 @@ def test_single_environment_is_the_vector_environment():
     assert ends[2][0][0] == 481 and ends[2][0][1]["final_time_s"] == 961 and not ends[2][0][1]["crashed"]
     assert ends[3][0][1]["crashed"] and 162 < ends[3][0][0] < 480
     assert len({end[0][0] for end in ends}) == 4
+
+
+@pytest.mark.parametrize(
+    "env_id, steering, last",
+    [
+        (FIXED, "ascent", 481),
+        (CUTOFF, "over the top", 481),
+        (CUTOFF, "ascent", None),
+        (FIXED, "late dive", None),
+        (CUTOFF, "early crash", None),
+    ],
+)
+def test_steps_outside_an_episode_are_refused(env_id, steering, last):
+    """Before the first reset, after an end by the clock, by the cut-off and by a crash."""
+    env = single(env_id, action_frame="local").unwrapped  # Gymnasium's wrapper refuses the first step by itself
+    with pytest.raises(ResetNeeded, match=r"call reset\(\) first"):
+        env.step(np.ones(3))
+    for _ in range(2):
+        obs, ended, t = env.reset()[0], False, 0
+        while not ended:
+            obs, _, ended, _, final = env.step(STEERING[steering](obs, t))
+            t += 1
+        assert (t == 481) == (last == 481) and final["crashed"] == (steering in ("late dive", "early crash"))
+        for _ in range(2):
+            with pytest.raises(ResetNeeded, match="again after an episode has ended"):
+                env.step(np.ones(3))
 
 
 @pytest.mark.parametrize("env_id", IDS)
