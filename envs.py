@@ -1,6 +1,6 @@
 """Dynamics, problem tables and environments: one batched code for the single and the vector environment.
 
-Importing this module registers (section "Numerical Simulations" of the paper)
+Importing this module registers (section "Numerical Simulations" of the paper; the last, with free final time, is ours)
 
     DoubleIntegrator-v0  DoubleIntegratorWaypoints-v0  VanDerPol-v0  VanDerPolWaypoints-v0
     RocketAscent-v0  RocketAscentCutoff-v0
@@ -41,9 +41,10 @@ def van_der_pol(x, u, epsilon=0.1):
 
 
 def rk4(f, x, u, dt):
-    """One classical Runge-Kutta step of x' = f(x, u) with the control held, x a tuple of components (Eq. of x_{k+1}).
+    """One classical Runge-Kutta step of x' = f(x, u) with the control held, x a tuple of components.
 
-    Exact for the double integrator: its solution is quadratic in dt.
+    The paper's x_{k+1}, "performed using numerical methods such as Runge-Kutta schemes". Exact for the double
+    integrator: its solution is quadratic in dt.
     """
     k1 = f(x, u)
     k2 = f(tuple(xi + 0.5 * dt * ki for xi, ki in zip(x, k1)), u)
@@ -59,10 +60,10 @@ def rk4(f, x, u, dt):
 
 @dataclass(frozen=True)
 class Phase:
-    """One column of a parameter table. Matrices are diagonal: Q = diag(Q), Q_f = Qf I_2."""
+    """One column of a parameter table. Matrices are diagonal: Q = diag(Q), Q_f = Qf I_2 (printed for one column)."""
 
     steps: int  # duration / dt
-    target: tuple[float, float]  # position and velocity; passed through at the phase's end, not held
+    target: tuple[float, float]  # position and velocity; by our reading passed through at the phase's end, not held
     radius: float  # r_target: within it the bonus is paid
     R: float  # control cost
     Qf: float  # terminal cost
@@ -72,7 +73,7 @@ class Phase:
 
 @dataclass(frozen=True)
 class Problem:
-    """A parameter table: dynamics, control bound, phases. `x_max` bounds every state reachable from the start box."""
+    """A parameter table: dynamics, control bound, phases; `x_max` (ours) bounds every state reachable from the box."""
 
     env_id: str
     f: Callable
@@ -80,7 +81,7 @@ class Problem:
     phases: tuple[Phase, ...]
     x_max: tuple[float, float]
     dt: float = 0.1  # s
-    x0_max: float = 1.0  # "state bounds": the box of the initial states, never a constraint
+    x0_max: float = 1.0  # the table's "state bounds", by our reading the box of the initial states, never a constraint
 
     @property
     def steps(self) -> int:
@@ -132,7 +133,8 @@ PROBLEMS = {
     for problem in (DOUBLE_INTEGRATOR, DOUBLE_INTEGRATOR_WAYPOINTS, VAN_DER_POL, VAN_DER_POL_WAYPOINTS)
 }
 
-TRANSITION_STEPS = 5  # the observed target moves from the old waypoint to the new one over these steps of a phase
+# the observed target moves to the new waypoint over these first steps of a phase: the paper's number, linearly by ours
+TRANSITION_STEPS = 5
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Environments
@@ -204,10 +206,11 @@ class BatchedEnv(VectorEnv):
 class PhasedVectorEnv(BatchedEnv):
     """The double integrator and Van der Pol families: N copies of a `Problem` with one or several phases.
 
-    Observation: [x1, x2, tau] with one phase, [x1, x2, x1_target, x2_target, tau, phi] with several; tau = t / T, phi
-    the 0-based phase over (phases - 1). Action: u, clipped at the control bound. Reward: -(dx'Q dx + R u^2) with dx the
-    distance to the phase's target before the step; a phase's last step adds -Qf |dx|^2 + B 1[|dx| <= r] after it, so
-    that an episode's rewards sum to bonus - J. The end of the horizon is `terminated` (time is observed).
+    Observation: the paper's o_t = [x1, x2, x1_target, x2_target, tau, phi] with several phases, [x1, x2, tau] with one
+    (ours); tau = t / T, phi the 0-based phase over (phases - 1). Action: u, clipped at the control bound. Reward: the
+    paper's r_t, -(dx'Q dx + R u^2) with dx the distance to the phase's target before the step; a phase's last step adds
+    -Qf |dx|^2 + B 1[|dx| <= r] after it, so that an episode's rewards sum to bonus - J. The paper prints r_t for one
+    phase and target 0; that each phase has its own is ours. The end of the horizon is `terminated` (time is observed).
 
     `final_info`: `episodic_return` (with the true radii), `cost`, `cost_state`, `cost_control`, `cost_terminal`, each
     (N,), and `hit` and `terminal_error` (the distance to the target at each phase's end), each (N, phases).
@@ -384,7 +387,8 @@ def fly(env_id: str, policy: Callable, x0, **options) -> dict:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Rocket ascent: vehicle, Earth and target (the paper's table "Vehicle Properties and Simulation Parameters")
+# Rocket ascent: vehicle, Earth and target (the paper's table "Vehicle Properties and Simulation Parameters", and where
+# it rounds or has no row the constants of the GPOPS-II benchmark that it is adapted from)
 # ---------------------------------------------------------------------------------------------------------------------
 
 
@@ -395,7 +399,7 @@ class Engine:
     total_mass: float  # kg
     propellant: float  # kg
     thrust: float  # N
-    isp: float  # s, as the table rounds it
+    isp: float  # s, the table's, which its propellant, thrust and burn time contradict (stage 2: 467.2 s)
     burn_time: float  # s
 
     def flow(self, table_isp: bool) -> float:
@@ -444,7 +448,7 @@ STAGE_2 = Engine(total_mass=19300.0, propellant=16820.0, thrust=110094.0, isp=46
 
 @dataclass(frozen=True)
 class Rocket:
-    """Constants of the GPOPS-II benchmark. A vehicle of your own is `dataclasses.replace(ROCKET, ...)`."""
+    """The paper's rocket, Earth and target. A vehicle of your own is `dataclasses.replace(ROCKET, ...)`."""
 
     burns: tuple[Burn, ...] = (
         Burn(75.2, ((6, BOOSTER), (1, STAGE_1)), dropped=((6, BOOSTER),)),
@@ -460,7 +464,7 @@ class Rocket:
     H: float = 7200.0  # m
     Cd: float = 0.5
     S: float = 4 * np.pi  # m^2
-    latitude: float = 28.5  # degrees, geocentric; the longitude is 0
+    latitude: float = 28.5  # degrees, by our reading geocentric; the longitude is 0 (ours)
     a: float = 24361140.0  # m, target orbit
     e: float = 0.7308
     i: float = 28.5  # degrees
@@ -514,7 +518,8 @@ def ascent(x, u, rocket: Rocket = ROCKET):
     """r' = v, v' = -mu r / |r|^3 + T u / m + D / m, m' = -flow ("Multiphase Rocket Ascent Problem").
 
     D = -1/2 rho Cd S |v_rel| v_rel, rho = rho0 exp(-h / H), v_rel = v - omega_e x r. x: r, v, m by components; u: the
-    unit thrust direction by components, thrust T (N) and propellant flow (kg/s).
+    unit thrust direction by components, thrust T (N) and propellant flow (kg/s). The paper's drag acts "during
+    atmospheric phases", this one always: it fades with the density.
     """
     rx, ry, rz, vx, vy, vz, m = x
     ux, uy, uz, thrust, flow = u
@@ -589,7 +594,7 @@ def target_axes(rocket: Rocket = ROCKET) -> np.ndarray:
 def terminal_error(state, rocket: Rocket = ROCKET) -> np.ndarray:
     """(h - h_T) / |h_T| and e - e_T in ECI, (..., 6), of states (..., 6 or more: r in m, v in m/s).
 
-    Smooth, without a singularity, and zero exactly where all five elements are the target's.
+    Our measure. Smooth, without a singularity, and zero exactly where all five elements are the target's.
     """
     h, e = orbit_vectors(np.moveaxis(np.asarray(state, dtype=np.float64), -1, 0), rocket.mu)
     h_target, e_target = target_orbit(rocket.target, rocket.mu)
@@ -599,15 +604,16 @@ def terminal_error(state, rocket: Rocket = ROCKET) -> np.ndarray:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Rocket ascent: the five parts of the reward (the paper names them and gives no formula; these are ours)
+# Rocket ascent: the five parts of the reward (the paper says what each is for and gives no formula: these are ours)
 # ---------------------------------------------------------------------------------------------------------------------
 
 
 def orbital_reward(distance, next_distance):
     """R_orbital = 10 (L_t - L_{t+1}), L the sum of |component| of the terminal error in the target orbit's axes.
 
-    Over an episode it adds up to 10 (L_0 - L_T): it is the objective, not a policy-invariant shaping. A sum over
-    components, because a norm hides the small ones behind the largest.
+    The paper speaks of "exponential shaping"; this is linear. Over an episode it adds up to 10 (L_0 - L_T): it is the
+    objective, not a policy-invariant shaping. A sum over components, because a norm hides the small ones behind the
+    largest.
     """
     return 10.0 * (distance - next_distance)
 
@@ -620,7 +626,7 @@ def trajectory_reward(energy, next_energy, phase, weight):
 def guidance_reward(u, up, along, pitch, weight):
     """R_guidance = -w (1 - u . d), d the direction at the reference pitch above the horizon, along the target's plane.
 
-    u, up, along (3, N); pitch (N,) in rad at the step's start, NaN where there is no guidance.
+    u, up, along (3, N); pitch (N,) in rad at the step's start, NaN where there is no guidance: by default everywhere.
     """
     cosine = (u * (np.sin(pitch) * up + np.cos(pitch) * along)).sum(axis=0)
     return np.where(np.isnan(pitch), 0.0, -weight * (1 - cosine))
@@ -632,6 +638,9 @@ def penalties(altitude, time, turn, burnt, left, mass_weight):
     c = 1[h < 0], a crash, which must cost more than the worst miss; o = clip((h - 245 km) / 100 km, 0, 1), overshoot;
     s = clip((110 km - h) / 30 km, 0, 1) after 300 s, a dip into the air at orbital speed; b (kg), the propellant that a
     step of the last phase burns, l, what a crash leaves of it. Altitude h (m), time (s): the step's end's.
+
+    The paper names h > 0, overshoot beyond 250 km and |u_t - u_{t-1}|; the sizes, the margin that lets o begin at
+    245 km, the dip below 110 km and the price of propellant are ours.
     """
     crash = altitude < 0
     overshoot = np.minimum(np.maximum((altitude - 245e3) / 100e3, 0.0), 1.0)
@@ -645,15 +654,20 @@ TERMINAL_SCALE = 0.005  # of the reported R_terminal
 def terminal_reward(error_norm, scale=TERMINAL_SCALE):
     """R_terminal = -2 ln(1 + d / scale) at the episode's end, d the norm of the terminal error: steep near the target.
 
-    A norm, unlike R_orbital's sum: near the target the largest component is the one to work on, and the noise in the
-    others, which a sum of absolute values charges in full, hardly counts. Errors far below the scale earn almost the
-    same, so a scale that shrinks with the policy's noise is a curriculum of training.
+    In place of the paper's points (see below). A norm, unlike R_orbital's sum: near the target the largest
+    component is the one to work on, and the noise in the others, which a sum of absolute values charges in full, hardly
+    counts. Errors far below the scale earn almost the same, so a scale that shrinks with the policy's noise is a
+    curriculum of training.
     """
     return -2.0 * np.log1p(error_norm / scale)
 
 
 def precision_points(error_norm):
-    """The paper's terminal points, 2000 1[d < 0.02] + 1600 e^(-d/0.01) + 1600 e^(-d/0.001): reported only."""
+    """2000 1[d < 0.02] + 1600 e^(-d/0.01) + 1600 e^(-d/0.001), d as in `terminal_reward`: reported only.
+
+    The paper pays 2000 points "for successful orbital insertion" and "precision bonuses up to 3200 points"; what is
+    successful and how the bonuses fall it does not say: 0.02 and the exponentials are ours.
+    """
     return 2000.0 * (error_norm < 0.02) + 1600.0 * (np.exp(-error_norm / 0.01) + np.exp(-error_norm / 0.001))
 
 
@@ -687,17 +701,19 @@ class RocketVectorEnv(BatchedEnv):
     """N launches into a transfer orbit in four phases, steered by the thrust direction; 2 s steps, exact events.
 
     Observation: [r (3) m, v (3) m/s, m kg, t_norm, phi] in ECI, t_norm = 1 - t / 961 s, phi in {0, 1/3, 2/3, 1} the
-    phase at the step's start. Action: the thrust direction, any length but 0 (BadInput), normalised here; with
-    `action_frame="local"` by (up, along-track, cross-track of the target plane) at the step's start, then held in ECI.
-    A step is one RK4 step between events: staging, a stage that runs dry (`table_isp`), the end of the episode.
+    phase (the paper's 0 to 3, over 3) at the step's start. Action: the thrust direction, any length but 0 (BadInput),
+    normalised here; with `action_frame="local"` by (up, along-track, cross-track of the target plane) at the step's
+    start, then held in ECI. A step is one RK4 step between events: staging, a stage that runs dry (`table_isp`), the
+    end of the episode.
 
-    With `cutoff` the engine stops when, in the last phase, the specific energy reaches the target's: the root within
-    the step, to 1e-10, ends the episode. An altitude below 0 ends it too (crash), and so does `end_time`.
+    With `cutoff` (ours: the paper fixes the final time) the engine stops when, in the last phase, the specific energy
+    reaches the target's: the root within the step, to 1e-10, ends the episode. An altitude below 0 ends it too (crash),
+    and so does `end_time`.
 
     Reward: the sum of the five parts R_orbital, R_trajectory, R_guidance, R_penalties and R_terminal, each a function
     above. `final_info`, (N,) each: `error_norm` (and `error` (N, 6), the terminal error in ECI), `a_km e i_deg raan_deg
-    argp_deg final_mass_kg final_time_s max_altitude_km` (at the steps' ends), the parts' sums, `episodic_return`, the
-    paper's `points`, `crashed`.
+    argp_deg final_mass_kg final_time_s max_altitude_km` (at the steps' ends), the parts' sums, `episodic_return`,
+    `points` (`precision_points`), `crashed`.
 
     Attributes that only training changes, to be set before a `reset`: `mass_weight`, `trajectory_weight`,
     `guidance_weight`, `guidance` (a key of `REFERENCE_PITCH`), `end_time` (s, at most the last phase's end) and
@@ -958,7 +974,7 @@ def fly_rocket(env_id: str, policy: Callable, end_time: float | None = None, **o
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Registration (no max_episode_steps: the horizon is the problem's own, and its end a true one)
+# Registration (no max_episode_steps: the horizon is the problem's own, and its end, by our reading, a true one)
 # ---------------------------------------------------------------------------------------------------------------------
 
 for _env_id in PROBLEMS:

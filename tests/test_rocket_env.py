@@ -44,7 +44,7 @@ KEYS = {
     "max_altitude_km", "episodic_return", "points", "crashed",
 }  # fmt: skip
 
-# --- the paper's problem, typed once more -----------------------------------------------------------------------------
+# --- the paper's problem with the benchmark's constants, typed once more ----------------------------------------------
 
 MU, RE, OMEGA, SEA_LEVEL_G = 3.986012e14, 6378145.0, 7.29211585e-5, 9.80665
 LATITUDE = math.radians(28.5)
