@@ -1,4 +1,4 @@
-"""Draw the README's two explanatory figures (the paper's Figures 1 and 2, redrawn) beside this script.
+"""Draw the README's two explanatory figures (after the paper's Figures 1 and 2) beside this script.
 
     python docs/figures.py
 
@@ -248,7 +248,7 @@ def sublayer(ax, y, x_in, x_branch, x_sum, x_norm, x_gate, name, rail=0.9):
 
 
 def block_notes(ax):
-    """The open block, below: the paper's equations."""
+    """The open block, below: the paper's equations, and how R is had, which is ours."""
     text(ax, 0.4, 1.70, r"$q_i = x_i W^Q,\;\; k_j = x_j W^K,\;\; R$ learned per head and distance", 11, ha="left")
     text(ax, 0.4, 1.42, r"softmax over $j$: the memory and the current input", 11, ha="left")
     text(ax, 0.4, 0.86, r"$h_1 = \mathrm{gate}(x,\;\mathrm{LayerNorm}(x + \mathrm{MultiHead}(x)))$", 12, ha="left")
