@@ -485,6 +485,12 @@ class Rocket:
         return np.array([*r, 0.0, self.omega_e * r[0], 0.0, mass])
 
     @property
+    def dry_mass(self) -> float:
+        """kg: what is left when the last stage has burnt all its propellant, the payload included."""
+        last_stage = self.burns[-1].engines
+        return self.payload + sum(n * (engine.total_mass - engine.propellant) for n, engine in last_stage)
+
+    @property
     def target(self) -> OrbitalElements:
         """The target orbit's elements in m and rad."""
         return OrbitalElements(self.a, self.e, *np.radians([self.i, self.raan, self.argp]))
@@ -736,9 +742,6 @@ class RocketVectorEnv(BatchedEnv):
         self.rocket = replace(rocket, table_isp=table_isp or rocket.table_isp)
         self._last_phase = len(rocket.burns) - 1
         self._propellant = sum(n * engine.propellant for n, engine in rocket.burns[-1].engines)  # of the last stage
-        self._dry_mass = rocket.payload + sum(
-            n * (engine.total_mass - engine.propellant) for n, engine in rocket.burns[-1].engines
-        )
         self.cutoff, self.action_frame, self.observe_phase = cutoff, action_frame, observe_phase
         self.mass_weight, self.trajectory_weight, self.guidance_weight, self.guidance = 0.0, 0.0, 0.1, "none"
         self.terminal_scale = TERMINAL_SCALE
@@ -911,7 +914,7 @@ class RocketVectorEnv(BatchedEnv):
         if REFERENCE_PITCH[self.guidance] is not None:
             pitch = np.radians(np.interp(self._grid[t], *REFERENCE_PITCH[self.guidance], right=np.nan))
             parts[2] = guidance_reward(u, *local_frame(before, self._axes[2])[:2], pitch, self.guidance_weight)
-        left = np.minimum(self.y[6] - self._dry_mass, self._propellant)
+        left = np.minimum(self.y[6] - self.rocket.dry_mass, self._propellant)
         parts[3] = penalties(altitude, self.time, turn, burnt, left, self.mass_weight)
         self._parts += parts
         if done.any():

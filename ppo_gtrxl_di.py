@@ -10,27 +10,19 @@ Top to bottom: arguments (Table 1), problem, Gated Transformer-XL, agent, PPO, c
 
 from __future__ import annotations
 
-import copy
-import json
 import math
-import signal
-import sys
-import time
-from dataclasses import asdict, dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 from pathlib import Path
 
-import gymnasium as gym
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import nn
 from torch.distributions import Normal
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
-from torch.utils.tensorboard import SummaryWriter
 
-import evaluate
-from runs import check, fail, gathered, join_processes, keep_memory, load_state, parse, process, refuse, save_run, total
+import runs
+from runs import total
 
 
 @dataclass
@@ -75,7 +67,7 @@ class Args:
     total_updates: int = 1000  # number of updates
     num_envs: int = 80  # number of parallel environments, each flying one episode per update
     learning_rate: float = 3e-4  # learning rate of the first update
-    learning_rate_final: float = 3e-5  # learning rate of the last update (linear in between); with kl the lowest
+    learning_rate_final: float = 3e-5  # that of the last update (linear in between); with kl the lowest
     gamma: float = 0.99  # the discount factor gamma
     gae_lambda: float = 0.95  # the lambda for the general advantage estimation
     gae_lambda_final: float | None = None  # the same in the last update (linear in between; none: --gae-lambda)
@@ -87,14 +79,13 @@ class Args:
     ent_coef_final: float = 1e-4  # coefficient of the entropy in the last update (linear in between)
     vf_coef: float = 0.2  # coefficient of the value function
     max_grad_norm: float = 0.5  # the maximum norm for the gradient clipping
-    target_kl: float | None = None  # KL divergence from which an update takes no further step
-    target_kl_final: float | None = None  # the same in the last update (linear in between; none: --target-kl)
+    target_kl: float | None = None  # the KL divergence from which an update takes no further step (none: no limit)
     lr_schedule: str = "linear"  # linear, or kl: the learning rate follows half of --target-kl between its two ends
-    return_norm: str = "none"  # none, time (the critic learns returns less their mean at a step), linear (less a fit)
-    noise: str = "learned"  # who sets the log-std: learned, schedule (linear), gated (falls as the episodes succeed)
-    log_std: float = 0.0  # initial log of the policy's standard deviation, in the action's unit
-    log_std_final: float = -4.0  # with schedule the last update's, with gated the lowest (--log-std: the highest)
-    noise_decay: float = 0.985  # gated: factor on the standard deviation after an update whose episodes succeed
+    noise: str = "learned"  # who sets the log-std: learned, schedule (linear), gated (linear, waits for the episodes)
+    log_std: float = 0.0  # initial log of the policy's standard deviation, in the action's unit, -8 to 0.5
+    log_std_final: float = -4.0  # the last update's with schedule and gated
+    flights_per_start: int = 1  # flights of each start, compared with one another (1: the paper)
+    refine_from: float = 0.55  # part of the updates after which starts are flown in groups and the noise falls
     weight_average: float = 0.998  # decay of the averaged weights used in evaluation (0: off)
 
 
@@ -115,16 +106,20 @@ def mean_action(output, action_scale):
     return output * action_scale
 
 
-def set_curriculum(envs, args, progress):
-    """Training radius of the waypoints: K r at first, shrinking geometrically to r over 60 % of the updates."""
+def set_curriculum(envs, args, progress, std):
+    """What only training changes: many starts first, later each start several times, compared with one another.
+
+    The waypoints' radius is K r at first and shrinks geometrically to r until then.
+    """
+    refines = progress >= args.refine_from
+    envs.flights_per_start = args.flights_per_start if refines else 1
     if len(envs.problem.phases) > 1:
-        envs.radius_scale = args.radius_curriculum ** max(0.0, 1 - progress / 0.6)
+        envs.radius_scale = 1.0 if refines else args.radius_curriculum ** (1 - progress / args.refine_from)
 
 
-def noise_trend(episodes, std):
-    """--noise gated: -1 lowers the noise (85 % of the sampled episodes hit every circle), 1 raises it (not half)."""
-    hits = episodes["hit"].all(axis=1).mean()
-    return -1 if hits >= 0.85 else int(hits < 0.5)
+def precise_enough(episodes, std):
+    """--noise gated: lower the noise once most of the sampled episodes hit every circle."""
+    return episodes["hit"].all(axis=1).mean() >= 0.85
 
 
 def describe(episodes, metrics):
@@ -176,34 +171,46 @@ class RelativeAttention(nn.Module):
         (N, T, d), L, H, dk = x.shape, self.memory_length, self.num_heads, self.dk
         chunks = math.ceil(T / max(L // 2, 64))
         C = math.ceil(T / chunks)
-        pad = (0, 0, 0, chunks * C - T)
+        pad = (0, 0, 0, chunks * C - T)  # steps after the last, so that every chunk has C
         context = torch.cat([memory, x], dim=1)  # (N, L + T, d)
-        q = F.pad(self.query(x) / math.sqrt(dk), pad).view(N, chunks, C, H, dk).transpose(2, 3)  # (N, chunks, H, C, dk)
-        k, v = (F.pad(map_(context), pad).unfold(1, L + C, C).unflatten(2, (H, dk)) for map_ in (self.key, self.value))
-        scores = q @ k + self.position_scores(q)  # k, v (N, chunks, H, dk, L + C), scores (N, chunks, H, C, L + C)
+        q = F.pad(self.query(x) / math.sqrt(dk), pad)  # (N, chunks * C, d)
+        q = q.view(N, chunks, C, H, dk).transpose(2, 3)  # (N, chunks, H, C, dk)
+        k = F.pad(self.key(context), pad).unfold(1, L + C, C)  # (N, chunks, d, L + C), one window a chunk
+        k = k.unflatten(2, (H, dk))  # (N, chunks, H, dk, L + C)
+        v = F.pad(self.value(context), pad).unfold(1, L + C, C)
+        v = v.unflatten(2, (H, dk))
+        scores = q @ k + self.position_scores(q)  # (N, chunks, H, C, L + C)
         attended = scores.softmax(dim=-1) @ v.transpose(-1, -2)  # (N, chunks, H, C, dk)
-        return self.out(attended.transpose(2, 3).reshape(N, chunks * C, d)[:, :T])
+        attended = attended.transpose(2, 3).reshape(N, chunks * C, d)
+        return self.out(attended[:, :T])
 
     def position_scores(self, q):
-        """q_i R_{i-j}^T of q (N, chunks, H, C, dk) under the keys of its window, -inf elsewhere: (..., C, L + C).
+        """q_i R_{i-j}^T of q (N, chunks, H, C, dk) under the keys j of its window, -inf elsewhere: (..., C, L + C).
 
-        Row i belongs under keys i..i+L (distance L..0): padded with C times -inf and cut anew, it moves right by i.
+        Row i's L + 1 products, distance L first, belong under the keys i..i+L: row i has to move right by i. Padded
+        with C columns, laid out as a line and cut anew into rows a column shorter, it does. L = 2, C = 3, "." -inf:
+
+            a2 a1 a0 .  .  .        a2 a1 a0 .  .
+            b2 b1 b0 .  .  .   ->   .  b2 b1 b0 .
+            c2 c1 c0 .  .  .        .  .  c2 c1 c0
         """
         C, L = q.shape[-2], self.memory_length
-        products = F.pad(torch.einsum("nchqd,hld->nchql", q, self.R.flip(1)), (0, C), value=-torch.inf)
-        return products.flatten(-2)[..., : C * (L + C)].unflatten(-1, (C, L + C))
+        products = torch.einsum("nchqd,hld->nchql", q, self.R.flip(1))  # (N, chunks, H, C, L + 1)
+        line = F.pad(products, (0, C), value=-torch.inf).flatten(-2)  # (N, chunks, H, C * (L + 1 + C))
+        return line[..., : C * (L + C)].unflatten(-1, (C, L + C))
 
     def start_cache(self, memory, steps):
         """Keys and values of the memory (N, L, d) with room for `steps` more, (2, N, H, L + steps, dk); and what every
         step uses: the three projections as one (3 d, d), and R in the order of the window's keys (H, L + 1, dk)."""
         kv = torch.stack([self.key(memory), self.value(memory)]).unflatten(-1, (self.num_heads, self.dk))
+        kv = F.pad(kv.transpose(2, 3), (0, 0, 0, steps))
         projections = torch.cat([self.query.weight / math.sqrt(self.dk), self.key.weight, self.value.weight])
-        return F.pad(kv.transpose(2, 3), (0, 0, 0, steps)), projections, self.R.flip(1)
+        return kv, projections, self.R.flip(1)
 
     def step(self, x, cache, t):
         """Step t alone: x (N, d) -> (N, d); writes its key and value into the cache, reads the window before it."""
         (kv, projections, R), L = cache, self.memory_length
-        qkv = F.linear(x, projections).view(len(x), 3, self.num_heads, 1, self.dk).transpose(0, 1)
+        qkv = F.linear(x, projections).view(len(x), 3, self.num_heads, 1, self.dk).transpose(0, 1)  # (3, N, H, 1, dk)
         kv[:, :, :, t + L : t + L + 1] = qkv[1:]
         k, v = kv[:, :, :, t : t + L + 1]  # (N, H, L + 1, dk)
         scores = qkv[0] @ (k + R).transpose(-1, -2)  # (N, H, 1, L + 1)
@@ -227,8 +234,11 @@ class GTrXLBlock(nn.Module):
 
 
 # Shared: agent ("Architecture Overview": encoder, GTrXL, policy head, value head) -------------------------------------
+LOG_STD_RANGE = (-8.0, 0.5)
+
+
 class Agent(nn.Module):
-    """Actor and critic on one GTrXL trunk. The policy is Gaussian with a learned, state-independent log-std."""
+    """Actor and critic on one GTrXL trunk. The policy is Gaussian with a state-independent log-std."""
 
     def __init__(self, args, envs):
         super().__init__()
@@ -276,12 +286,25 @@ class Agent(nn.Module):
     def get_policy(self, hidden):
         """The Gaussian that training samples from, of hidden (..., d): over actions (..., actions), in their unit."""
         mean = self.get_mean_action(hidden)
-        return Normal(mean, self.actor_logstd.clamp(-5.0, 0.5).exp().expand_as(mean), validate_args=False)
+        return Normal(mean, self.actor_logstd.clamp(*LOG_STD_RANGE).exp().expand_as(mean), validate_args=False)
 
     def evaluate_actions(self, hidden, actions):
         """log pi(a|s), the policy's entropy and the critic's output, (...) each, of hidden (..., d), (..., actions)."""
         probs = self.get_policy(hidden)
         return probs.log_prob(actions).sum(-1), probs.entropy().sum(-1), self.critic(hidden).squeeze(-1)
+
+    def make_policy(self, steps):
+        """What evaluation flies: the mean action, with no noise in the memory, of (obs (N, obs), t) in NumPy."""
+        like, cache = self.actor_logstd, []
+
+        @torch.no_grad()
+        def policy(obs, t):
+            if t == 0:
+                cache[:] = self.start_cache(self.new_memory(len(obs), noise=0.0), steps)
+            hidden = self.encode_step(torch.as_tensor(obs, dtype=like.dtype, device=like.device), cache, t)
+            return self.get_mean_action(hidden).cpu().numpy()
+
+        return policy
 
 
 # Shared: PPO (Algorithm 1) --------------------------------------------------------------------------------------------
@@ -296,24 +319,24 @@ class Batch:
     values: torch.Tensor  # (T, N), the critic's output
     alive: torch.Tensor  # (T, N)
     memory: torch.Tensor  # (blocks, N, L, d)
-    advantages: torch.Tensor | None = None  # (T, N), filled by update, as the returns
-    returns: torch.Tensor | None = None  # (T, N), the critic's target
+    advantages: torch.Tensor | None = None  # (T, N), filled by train, as the returns
+    returns: torch.Tensor | None = None  # (T, N), what the critic learns
 
 
 @torch.no_grad()
 def rollout(agent, envs, reward_scale, memory_noise):
-    """One episode in each environment (Algorithm 1, lines 4-11): the Batch and all processes' `final_info`."""
+    """One episode in each environment (Algorithm 1, lines 3-13): the Batch and all processes' `final_info`."""
     T, N, like = envs.episode_steps, envs.num_envs, agent.actor_logstd
     shapes = envs.single_observation_space.shape, envs.single_action_space.shape, (), (), (), ()
-    batch = Batch(*(like.new_zeros(T, N, *shape) for shape in shapes), agent.new_memory(N, memory_noise))
+    batch = Batch(*(like.new_zeros(T, N, *shape) for shape in shapes), agent.new_memory(N, memory_noise))  # line 5
     cache, hidden = agent.start_cache(batch.memory, T), like.new_zeros(T, N, agent.embed_dim)
     alive, episodes, (next_obs, _) = np.ones(N, dtype=bool), {}, envs.reset()
     batch.obs[:] = torch.as_tensor(next_obs)  # steps that nobody lives to are computed, too: they need a real state
-    for t in range(T):
+    for t in range(T):  # line 6
         batch.obs[t], batch.alive[t] = torch.as_tensor(next_obs), torch.as_tensor(alive)
-        hidden[t] = agent.encode_step(batch.obs[t], cache, t)
-        batch.actions[t] = agent.get_policy(hidden[t]).sample()
-        next_obs, reward, terminated, _, info = envs.step(batch.actions[t].cpu().numpy())
+        hidden[t] = agent.encode_step(batch.obs[t], cache, t)  # lines 7 and 10
+        batch.actions[t] = agent.get_policy(hidden[t]).sample()  # line 8
+        next_obs, reward, terminated, _, info = envs.step(batch.actions[t].cpu().numpy())  # line 9
         batch.rewards[t] = torch.as_tensor(reward * alive * reward_scale)
         ended = alive & terminated
         for key, value in info.get("final_info", {}).items():
@@ -322,7 +345,7 @@ def rollout(agent, envs, reward_scale, memory_noise):
         if not alive.any():
             break
     batch.logprobs, _, batch.values = agent.evaluate_actions(hidden, batch.actions)
-    everyone = gathered(episodes)
+    everyone = runs.gathered(episodes)
     return batch, {key: np.concatenate([part[key] for part in everyone]) for key in episodes}
 
 
@@ -332,12 +355,62 @@ def gae(rewards, values, alive, gamma, gae_lambda):
     next_value, next_alive = torch.zeros_like(values[0]), torch.zeros_like(alive[0])
     for t in reversed(range(len(rewards))):
         delta = rewards[t] + gamma * next_value * next_alive - values[t]
-        advantages[t] = lastgaelam = (delta + gamma * gae_lambda * next_alive * lastgaelam) * alive[t]
+        lastgaelam = (delta + gamma * gae_lambda * next_alive * lastgaelam) * alive[t]
+        advantages[t] = lastgaelam
         next_value, next_alive = values[t], alive[t]
     return advantages, advantages + values
 
 
-def ppo_loss(agent, batch, mb, args):
+def moments(x, alive, dim):
+    """Mean and variance along dim of the living steps of every process."""
+    count = total(alive.sum(dim, keepdim=True)).clamp(min=1)
+    mean = total((x * alive).sum(dim, keepdim=True)) / count
+    variance = total(((x - mean) ** 2 * alive).sum(dim, keepdim=True)) / count
+    return mean, variance
+
+
+def linear_fit(x, y, alive):
+    """Ridge regression of y (..., G) on x (..., G, k) over the G episodes of a group that live: the fitted y."""
+    weight, count = alive.double()[..., None], alive.double().sum(-1)[..., None, None].clamp(min=1)
+    x, y = x.double(), y.double()[..., None]
+    y_mean = (y * weight).sum(-2, keepdim=True) / count
+    x = (x - (x * weight).sum(-2, keepdim=True) / count) * weight
+    x = x / ((x * x).sum(-2, keepdim=True) / count).sqrt().add(1e-6)
+    ridge = 0.01 * count * torch.eye(x.shape[-1]).to(x)  # what all episodes share has no slope
+    slope = torch.linalg.solve(x.mT @ x + ridge, x.mT @ (y - y_mean))
+    return (y_mean + x @ slope)[..., 0].to(alive.dtype)
+
+
+def returns_baseline(batch, gamma, group):
+    """What of the returns the critic need not learn: V(s, t) = baseline + scale critic(s, t); (T, N) and (T, 1).
+
+    Each `group` of episodes that follow one another in the batch began alike. What their returns from step t on have in
+    common, and what is linear in the states that they have reached by then, is the baseline: near one path that is most
+    of it, and a critic's error would drown what small noise changes. Without groups (1) the critic learns the returns
+    themselves, as in the paper.
+
+    The fit holds the episode that it is the baseline of: its residual is (1 - h) times the leave-one-out one. h depends
+    on the states at that step alone, not on the action: each state's gradient keeps its direction, extreme states count
+    less.
+    """
+    if group == 1:
+        return torch.zeros_like(batch.rewards), torch.ones_like(batch.rewards[:, :1])
+    returns, _ = gae(batch.rewards, torch.zeros_like(batch.values), batch.alive, gamma, 1.0)  # Monte-Carlo
+    obs, returns, alive = (x.unflatten(1, (-1, group)) for x in (batch.obs, returns, batch.alive))
+    baseline = linear_fit(obs, returns, alive).flatten(1)
+    _, variance = moments(returns.flatten(1) - baseline, batch.alive, 1)
+    floor = 0.3 * variance.sqrt().mean()  # some steps have next to no spread
+    return baseline, (variance + floor**2 + 1e-8).sqrt()
+
+
+def explained_variance(prediction, returns, alive):
+    """1 - Var(returns - prediction) / Var(returns) over the living steps, as CleanRL's."""
+    _, left = moments(returns - prediction, alive, (0, 1))
+    _, all_of_it = moments(returns, alive, (0, 1))
+    return (1 - left / all_of_it).item()
+
+
+def ppo_loss(agent, batch, mb, clip_coef, vf_coef, ent_coef):
     """-L_CLIP + c1 L_VF - c2 H over the living steps of the episodes `mb`; returns it and what is logged.
 
     The minibatch is that of all processes: the loss is this one's share of its mean, what is logged is the sum.
@@ -345,338 +418,107 @@ def ppo_loss(agent, batch, mb, args):
     alive, advantages = batch.alive[:, mb], batch.advantages[:, mb]
     steps = total(alive.sum())
     mean = lambda x: (x * alive).sum() / steps  # noqa: E731
-    hidden = agent.encode(batch.obs[:, mb].transpose(0, 1), batch.memory[:, mb]).transpose(0, 1)
+    hidden = agent.encode(batch.obs[:, mb].transpose(0, 1), batch.memory[:, mb]).transpose(0, 1)  # line 17
     newlogprob, entropy, newvalue = agent.evaluate_actions(hidden, batch.actions[:, mb])
     logratio = newlogprob - batch.logprobs[:, mb]
     ratio = logratio.exp()
-    clipped = torch.clamp(ratio, 1 - args.clip_coef, 1 + args.clip_coef)
+    clipped = torch.clamp(ratio, 1 - clip_coef, 1 + clip_coef)
     pg_loss = mean(torch.max(-advantages * ratio, -advantages * clipped))
     v_loss = mean(0.5 * (newvalue - batch.returns[:, mb]) ** 2)
     entropy_loss = mean(entropy)
-    loss = pg_loss - args.ent_coef * entropy_loss + args.vf_coef * v_loss
+    loss = pg_loss - ent_coef * entropy_loss + vf_coef * v_loss
     losses = {"policy_loss": pg_loss, "value_loss": v_loss, "entropy": entropy_loss, "total_loss": loss}
     with torch.no_grad():  # http://joschu.net/blog/kl-approx.html
         losses |= {"old_approx_kl": mean(-logratio), "approx_kl": mean((ratio - 1) - logratio)}
-        losses["clipfrac"] = mean(((ratio - 1.0).abs() > args.clip_coef).to(ratio.dtype))
+        losses["clipfrac"] = mean(((ratio - 1.0).abs() > clip_coef).to(ratio.dtype))
     return loss, dict(zip(losses, total(torch.stack([value.detach() for value in losses.values()]))))
 
 
-def moments(x, alive, dim):
-    """Mean and variance along dim of the living steps of every process."""
-    count = total(alive.sum(dim, keepdim=True)).clamp(min=1)
-    mean = total((x * alive).sum(dim, keepdim=True)) / count
-    return mean, total(((x - mean) ** 2 * alive).sum(dim, keepdim=True)) / count
+# Shared: training (Algorithm 1) and main ------------------------------------------------------------------------------
+def linear_schedule(first, last, progress):
+    """`first` in the first update (progress 0), `last` in the last one (progress 1), linear in between."""
+    return first + (last - first) * progress
 
 
-def linear_fit(x, y, alive):
-    """Ridge regression of y (T, N) on x (T, N, k) over the living episodes of each step: the fitted y, (T, N)."""
-    (x_mean, variance), (y_mean, _) = moments(x.double(), alive[..., None], 1), moments(y, alive, 1)
-    x, steps = (x - x_mean) / (variance.sqrt() + 1e-6) * alive[..., None], total(alive.sum(1)).clamp(min=1)
-    ridge = 0.01 * steps[:, None, None] * torch.eye(x.shape[-1]).to(x)  # what all episodes share has no slope
-    slope = torch.linalg.solve(total(x.mT @ x) + ridge, total(x.mT @ (y - y_mean).double()[..., None]))
-    return y_mean + (x @ slope)[..., 0].to(y.dtype)
-
-
-def prepare(batch, args):
-    """Fill in advantages and the critic's targets (Algorithm 1, lines 12-13); returns the explained variance.
-
-    --return-norm time: V(s, t) = mean_t + std_t critic(s), from these episodes' returns from step t on. They share the
-    clock, so most of a return is common to all; the critic is left with what differs between them. linear: mean_t is
-    their linear fit in the observation; near one path, that is half of what differs.
-    """
-    alive, mean, std = batch.alive, 0.0, 1.0
-    if args.return_norm != "none":
-        target, _ = gae(batch.rewards, torch.zeros_like(batch.values), alive, args.gamma, 1.0)  # Monte-Carlo returns
-        mean = linear_fit(batch.obs, target, alive) if args.return_norm == "linear" else moments(target, alive, 1)[0]
-        variance = moments(target - mean, alive, 1)[1]
-        std = (variance + 0.09 * variance.sqrt().mean() ** 2 + 1e-8).sqrt()  # some steps have next to no spread
-    values = mean + std * batch.values
-    batch.advantages, returns = gae(batch.rewards, values, alive, args.gamma, args.gae_lambda)
-    batch.returns = returns if args.return_norm == "none" else (target - mean) / std
-    if args.norm_adv:
-        mean, variance = moments(batch.advantages, alive, (0, 1))
-        batch.advantages = (batch.advantages - mean) / (variance.sqrt() + 1e-8)
-    return 1 - (moments(returns - values, alive, (0, 1))[1] / moments(returns, alive, (0, 1))[1]).squeeze()
-
-
-def update(agent, average, optimizer, batch, args):
-    """K epochs of minibatches of whole episodes (Algorithm 1, lines 14-19); returns the mean of each logged loss.
+def train(args, agent, average, optimizer, envs, run):
+    """Algorithm 1, its lines beside ours. `run` counts, logs, saves and evaluates; it changes nothing that is learned.
 
     Raises FloatingPointError, before the optimiser moves the weights, when a loss or the gradient is not finite.
     """
-    explained_variance, log, N = prepare(batch, args), [], batch.alive.shape[1]
-    orders = [torch.randperm(N, device=batch.alive.device) for _ in range(args.update_epochs)]
-    minibatches = [(k + 1, mb) for order in orders for k, mb in enumerate(order.tensor_split(args.num_minibatches))]
-    for minibatch, mb in minibatches:
-        loss, losses = ppo_loss(agent, batch, mb, args)
-        log.append(losses)
-        if args.target_kl is not None and losses["approx_kl"] > args.target_kl:
-            break
-        optimizer.zero_grad()
-        loss.backward()
-        for grad in [parameter.grad for parameter in agent.parameters() if parameter.grad is not None]:
-            total(grad)
-        gradient = nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
-        for name, value in {**losses, "gradient norm": gradient}.items():
-            if not value.isfinite():
-                epoch = (len(log) - 1) // args.num_minibatches + 1
-                raise FloatingPointError(f"{name} is {value} in epoch {epoch}, minibatch {minibatch}")
-        optimizer.step()
-        average.update_parameters(agent)
-    means = {name: torch.stack([losses[name] for losses in log]).mean() for name in losses}
-    return {name: value.item() for name, value in {**means, "explained_variance": explained_variance}.items()}
+    target_kl = math.inf if args.target_kl is None else args.target_kl
+    for iteration in range(run.progress["total_updates"] + 1, args.total_updates + 1):  # line 2
+        progress = (iteration - 1) / max(args.total_updates - 1, 1)
+        ent_coef = linear_schedule(args.ent_coef, args.ent_coef_final, progress)
+        gae_lambda = linear_schedule(args.gae_lambda, args.gae_lambda_final, progress)
+        if args.lr_schedule == "linear":
+            optimizer.param_groups[0]["lr"] = linear_schedule(args.learning_rate, args.learning_rate_final, progress)
+        learning_rate = optimizer.param_groups[0]["lr"]
+        std = agent.actor_logstd.exp().mean().item()
+        set_curriculum(envs, args, progress, std)
 
+        # lines 3-13: fly one episode in every environment
+        batch, episodes = rollout(agent, envs, args.reward_scale, args.memory_noise)
 
-def linear_schedule(first, last, iteration, iterations):
-    """`first` in iteration 1, `last` in iteration `iterations`, linear in between."""
-    return first + (last - first) * (iteration - 1) / max(iterations - 1, 1)
+        # line 14: advantages, and what the critic learns
+        baseline, scale = returns_baseline(batch, args.gamma, envs.flights_per_start)
+        values = baseline + scale * batch.values
+        advantages, returns = gae(batch.rewards, values, batch.alive, args.gamma, gae_lambda)
+        batch.returns = (returns - baseline) / scale
+        if args.norm_adv:
+            mean, variance = moments(advantages, batch.alive, (0, 1))
+            advantages = (advantages - mean) / (variance.sqrt() + 1e-8)
+        batch.advantages = advantages
 
+        log = []
+        for epoch in range(1, args.update_epochs + 1):  # line 15
+            order = torch.randperm(envs.num_envs, device=advantages.device)
+            for minibatch, mb in enumerate(order.tensor_split(args.num_minibatches), start=1):  # line 16
+                loss, losses = ppo_loss(agent, batch, mb, args.clip_coef, args.vf_coef, ent_coef)
+                log.append(losses)
+                if losses["approx_kl"] > target_kl:
+                    break
+                optimizer.zero_grad()  # line 18
+                loss.backward()
+                runs.sum_gradients(agent)  # over torchrun's processes
+                gradient_norm = nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
+                runs.refuse_nan({**losses, "gradient norm": gradient_norm}, epoch, minibatch)
+                optimizer.step()
+                average.update_parameters(agent)
+            if losses["approx_kl"] > target_kl:
+                break  # the minibatch that went too far has taken no step, and ends the update
+        losses = {name: torch.stack([logged[name] for logged in log]).mean().item() for name in losses}
+        losses["explained_variance"] = explained_variance(batch.values, batch.returns, batch.alive)
+        losses["baseline_explained_variance"] = explained_variance(baseline, returns, batch.alive)
 
-def begin_update(args, agent, optimizer, envs, span):
-    """Set what follows a schedule; returns the arguments of this update. span: iteration, iterations."""
-    if args.lr_schedule == "linear":
-        optimizer.param_groups[0]["lr"] = linear_schedule(args.learning_rate, args.learning_rate_final, *span)
-    if args.noise == "schedule":
-        agent.actor_logstd.fill_(linear_schedule(args.log_std, args.log_std_final, *span))
-    set_curriculum(envs, args, linear_schedule(0.0, 1.0, *span))
-    names = "gae_lambda", "ent_coef", "target_kl"
-    ends = {name: (getattr(args, name), getattr(args, f"{name}_final")) for name in names}
-    return replace(args, **{name: linear_schedule(*pair, *span) for name, pair in ends.items() if None not in pair})
-
-
-def end_update(args, agent, optimizer, episodes, approx_kl):
-    """Set what follows this update: the learning rate its KL (kl), the noise its episodes (gated)."""
-    group = optimizer.param_groups[0]
-    if args.lr_schedule == "kl":
-        factor = 1 / 1.3 if approx_kl > 0.75 * args.target_kl else 1.2 if approx_kl < args.target_kl / 3 else 1.0
-        group["lr"] = min(max(group["lr"] * factor, args.learning_rate_final), args.learning_rate)
-    if args.noise == "gated":
-        step = -math.log(args.noise_decay) * noise_trend(episodes, agent.actor_logstd.exp().mean().item())
-        agent.actor_logstd.add_(step).clamp_(args.log_std_final, args.log_std)
-
-
-# Shared: arguments ----------------------------------------------------------------------------------------------------
-NETWORK = ("num_blocks", "embed_dim", "num_heads", "memory_length", "mlp_dim", "hidden_dim")
-POLICY = {name: type(getattr(Args, name)) for name in ("env_id", *ENV_OPTIONS, *NETWORK)}  # a checkpoint decides
-
-
-def parse_args(argv):
-    """The checked arguments; with --resume the saved training state, with --checkpoint what that file holds."""
-    args, saved = parse(Args, argv), None
-    typed = {word.split("=")[0][2:].replace("-", "_").removeprefix("no_") for word in argv if word.startswith("--")}
-    if args.resume is not None:
-        if refused := typed - {"resume", "cuda", "num_threads"}:
-            refuse(min(refused), "", "only --cuda and --num-threads may be given beside --resume")
-        saved = load_state(args.resume, Args, ENV_IDS)
-        args = Args(**{**saved["args"], **{name: getattr(args, name) for name in typed}})
-    elif args.checkpoint is not None:
-        saved = evaluate.read_checkpoint(args.checkpoint, POLICY)
-        for name in POLICY:
-            value, given = saved["args"][name], getattr(args, name)
-            if name == "env_id" and name in typed and value != given and BUFFERS.get(value) == BUFFERS.get(given):
-                print(f"--checkpoint is of {value}; it goes on with {given}")
-            elif name in typed and value != given:
-                refuse(name, given, f"the checkpoint has {value}; leave the flag out")
-            else:
-                setattr(args, name, value)
-    elif args.eval_only:
-        refuse("checkpoint", None, "must name the agent.safetensors that --eval-only flies")
-    check(args, typed, ENV_IDS)
-    args.eval_starts = args.eval_starts or (1000 if args.eval_only else 50)
-    return args, saved
-
-
-# Shared: checkpoints --------------------------------------------------------------------------------------------------
-def training_state(args, modules, envs, progress):
-    """All that a bit-exact resume needs, copied, so that training can go on while it is kept."""
-    modules = {name: module.state_dict() for name, module in modules.items()}
-    rng = {"torch": torch.get_rng_state(), "envs": json.dumps(envs.np_random.bit_generator.state)}
-    rng = gathered({**rng, "cuda": torch.cuda.get_rng_state_all()})
-    return copy.deepcopy({"args": {**asdict(args), "resume": None}, "progress": progress, "rng": rng, **modules})
-
-
-def restore(state, run_dir, modules, envs):
-    """Put everything back where `training_state` found it; returns the progress. One line if something does not fit."""
-    try:
-        for name, module in modules.items():
-            module.load_state_dict(state[name])
-        if len(state["rng"]) != process()[1]:
-            raise ValueError(f"it was trained by {len(state['rng'])} processes")
-        rng = state["rng"][process()[0]]
-        torch.set_rng_state(rng["torch"])
-        torch.cuda.set_rng_state_all(rng["cuda"][: torch.cuda.device_count()])
-        envs.np_random.bit_generator.state = json.loads(rng["envs"])
-        return {name: state["progress"][name] for name in ("seed", "total_updates", "global_step", "wall_seconds")}
-    except Exception as error:  # an edited file fails in many ways, all alike to the user
-        fail(f"--resume {run_dir}: its training_state.pt does not fit its own args ({error}); it must be whole")
-
-
-# Shared: evaluation, training, main -----------------------------------------------------------------------------------
-SAVE_EVERY = 10  # updates
-TRAINING_EVAL_SEED = 2**31  # beyond --eval-seed: no reported start is flown during training
-
-
-def evaluate_agent(agent, args, envs, eval_seed, progress):
-    """Fly the mean action, from noise-free memory, and the optimum: eval.json's metrics and eval.npz's arrays."""
-    like, cache = agent.actor_logstd, []
-
-    @torch.no_grad()
-    def policy(obs, t):
-        if t == 0:
-            cache[:] = agent.start_cache(agent.new_memory(len(obs), noise=0.0), envs.episode_steps)
-        hidden = agent.encode_step(torch.as_tensor(obs, dtype=like.dtype, device=like.device), cache, t)
-        return agent.get_mean_action(hidden).cpu().numpy()
-
-    options = {name: getattr(args, name) for name in ENV_OPTIONS}
-    metrics, arrays = evaluate.evaluate(args.env_id, policy, eval_seed, args.eval_starts, **options)
-    return {**metrics, **progress, "device": like.device.type, "torch_version": torch.__version__}, arrays
-
-
-def log_scalars(writer, prefix, values, global_step):
-    """Write every number of `values` under its TensorBoard tag."""
-    for name, value in values.items():
-        if isinstance(value, (int, float)):
-            writer.add_scalar(f"{prefix}/{name}", value, global_step)
-
-
-def log_update(writer, args, progress, batch, episodes, losses, learning_rate, metrics):
-    """CleanRL's tags for one update and, with each evaluation or a hundred times a run, a line to follow it by."""
-    iteration, step, seconds = (progress[name] for name in ("total_updates", "global_step", "wall_seconds"))
-    charts = {"episodic_return": episodes["episodic_return"].mean().item(), "learning_rate": learning_rate}
-    charts |= {"episodic_length": batch.alive.sum(dim=0).mean().item(), "SPS": int(step / seconds)}
-    log_scalars(writer, "charts", charts, step)
-    log_scalars(writer, "losses", losses, step)
-    if iteration % (args.eval_every or max(1, args.total_updates // 100)) == 0 or iteration == 1:
-        clock = f"{seconds / 60:.1f} min gone, {(args.total_updates - iteration) * seconds / iteration / 60:.1f} to go"
-        line = f"update {iteration}/{args.total_updates}, {step} steps, {clock}"
-        print(f"{line}: {describe(episodes, metrics)}", flush=True)
-
-
-def train(args, modules, envs, writer, run_dir, progress):
-    """Algorithm 1; returns the progress. Also what ends it early leaves the state after the last whole update."""
-    agent, average, optimizer = modules.values()
-    state, metrics = training_state(args, modules, envs, progress), {}
-    saves = args.save_model and run_dir is not None
-    save = partial(save_run, run_dir) if saves else lambda state: None
-    save(state)
-    try:
-        for iteration in range(progress["total_updates"] + 1, args.total_updates + 1):
-            start = time.time()
-            now = begin_update(args, agent, optimizer, envs, (iteration, args.total_updates))
-            learning_rate = optimizer.param_groups[0]["lr"]
-            batch, episodes = rollout(agent, envs, args.reward_scale, args.memory_noise)
-            losses = update(*modules.values(), batch, now)
-            end_update(now, agent, optimizer, episodes, losses["approx_kl"])
-            progress = {**progress, "total_updates": iteration}
-            progress["global_step"] += int(total(batch.alive.sum()))
-            progress["wall_seconds"] += time.time() - start
-            state = training_state(args, modules, envs, progress)
-            if process()[0] > 0:
-                continue  # the first process saves, evaluates and logs
-            if iteration % SAVE_EVERY == 0 or iteration == args.total_updates:
-                save(state)
-            if args.eval_every and iteration % args.eval_every == 0:
-                metrics, _ = evaluate_agent(average.module, args, envs, TRAINING_EVAL_SEED, progress)
-                log_scalars(writer, "eval", metrics, progress["global_step"])
-            log_update(writer, args, progress, batch, episodes, losses, learning_rate, metrics)
-    except (KeyboardInterrupt, FloatingPointError) as error:
-        save(state)
-        if isinstance(error, FloatingPointError):
-            kept = f"; the last good checkpoint is {run_dir}/training_state.pt" if saves else ""
-            fail(f"update {iteration}: {error}, must be finite{kept}")
-        kept = f"go on with: python {Path(__file__).name} --resume {run_dir}" if saves else "nothing saved"
-        if process()[0] == 0:
-            print(f"stopped after update {state['progress']['total_updates']}; {kept}")
-        raise
-    finally:
-        if writer:
-            writer.flush()
-    return progress
-
-
-def run(args, agent, envs, saved):
-    """Train (or go on), save, evaluate, print the table."""
-    run_dir = Path(args.resume or f"runs/{args.env_id}__{args.exp_name}__{args.seed}__{int(time.time())}")
-    modules = make_modules(args, agent)
-    if args.torch_compile:
-        agent.encode, agent.encode_step = torch.compile(agent.encode), torch.compile(agent.encode_step)
-    progress = {"seed": args.seed, "total_updates": 0, "global_step": 0, "wall_seconds": 0.0}
-    if args.resume is not None:
-        progress = restore(saved, run_dir, modules, envs)
-    if process()[0] > 0:
-        train(args, modules, envs, None, None, progress)
-        return
-    if args.track:
-        import wandb
-
-        names = {"project": args.wandb_project_name, "entity": args.wandb_entity, "name": run_dir.name}
-        wandb.init(**names, sync_tensorboard=True, config=asdict(args), save_code=True)
-    run_dir.mkdir(parents=True, exist_ok=args.resume is not None)
-    for leftover in run_dir.glob(".*.tmp"):  # of a writer that was killed
-        leftover.unlink()
-    evaluate.write_json(run_dir / "args.json", {**asdict(args), "resume": None})
-    writer = SummaryWriter(run_dir, purge_step=progress["global_step"] + 1)
-    progress = train(args, modules, envs, writer, run_dir, progress)
-    metrics, arrays = evaluate_agent(modules["average"].module, args, envs, args.eval_seed, progress)
-    log_scalars(writer, "eval", metrics, metrics["global_step"])
-    writer.close()
-    if args.save_model:
-        evaluate.write(metrics, arrays, run_dir / "agent.safetensors", run_dir / "eval.json", run_dir / "eval.npz")
-    if args.capture_video:
-        evaluate.figures(run_dir / "figures", arrays, metrics, evaluate.read_curve(run_dir))
-    print(evaluate.table(metrics))
-
-
-def make_agent(args, envs, saved):
-    """A new agent, with the weights of --checkpoint if there is one; one line if they do not fit."""
-    agent = Agent(args, envs).to("cuda" if torch.cuda.is_available() and args.cuda else "cpu")
-    if args.checkpoint is not None and args.resume is None:
-        try:
-            agent.load_state_dict({name: torch.from_numpy(array) for name, array in saved["tensors"].items()})
-        except (RuntimeError, TypeError) as error:
-            fail(f"--checkpoint {args.checkpoint}: its weights do not fit its own args ({error})")
-    return agent
-
-
-def make_modules(args, agent):
-    """All that training changes: the agent, its averaged weights, the optimiser."""
-    average = AveragedModel(agent, multi_avg_fn=get_ema_multi_avg_fn(args.weight_average))
-    optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
-    return {"agent": agent, "average": average, "optimizer": optimizer}
-
-
-def interrupt(signum, _):
-    """Ctrl-C and SIGTERM end a run alike; the exit status tells them apart: 130 and 143."""
-    raise KeyboardInterrupt(128 + signum)
+        # the learning rate and the noise of the next update
+        if args.lr_schedule == "kl" and losses["approx_kl"] > 0.75 * target_kl:
+            optimizer.param_groups[0]["lr"] = max(learning_rate / 1.3, args.learning_rate_final)
+        if args.lr_schedule == "kl" and losses["approx_kl"] < target_kl / 3:
+            optimizer.param_groups[0]["lr"] = min(learning_rate * 1.2, args.learning_rate)
+        falls = args.noise == "schedule" or args.noise == "gated" and precise_enough(episodes, std)
+        if falls and progress >= args.refine_from:
+            updates_left = max(args.total_updates - iteration, 1)
+            agent.actor_logstd += (args.log_std_final - agent.actor_logstd) / updates_left
+        run.end_update(iteration, batch.alive, episodes, losses, learning_rate)
 
 
 def main(argv):
-    args, saved = parse_args(argv)
-    keep_memory()
-    torch.set_num_threads(args.num_threads or torch.get_num_threads())
-    torch.manual_seed(args.seed)
-    torch.backends.cudnn.deterministic = args.torch_deterministic
-    rank, processes = join_processes(args.cuda)
-    share = args.num_envs // processes + (rank < args.num_envs % processes)
-    envs = gym.make_vec(args.env_id, num_envs=share, **{name: getattr(args, name) for name in ENV_OPTIONS})
-    envs.reset(seed=args.seed + 2**31 * rank)
-    agent = make_agent(args, envs, saved)
-    if rank > 0:  # the same weights, other noise
-        torch.manual_seed(args.seed + 2**31 * rank)
-    if args.eval_only:
-        metrics, arrays = evaluate_agent(agent, args, envs, args.eval_seed, saved["progress"])
-        evaluate.write(metrics, arrays, args.checkpoint, args.eval_json, args.eval_npz)
-        print(evaluate.table(metrics))
-    else:
-        run(args, agent, envs, saved)
+    args, saved = runs.parse_args(Args, argv, ENV_OPTIONS, BUFFERS)
+    device = runs.prepare_torch(args)
+    env_options = {name: getattr(args, name) for name in ENV_OPTIONS}
+    envs = runs.make_envs(args, env_options)
+    agent = Agent(args, envs).to(device)
+    runs.load_checkpoint(agent, args, saved)
+    average = AveragedModel(agent, multi_avg_fn=get_ema_multi_avg_fn(args.weight_average))
+    optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
+    run = runs.Run(args, saved, agent, average, optimizer, envs, env_options, describe)
+    if args.torch_compile:
+        agent.encode, agent.encode_step = torch.compile(agent.encode), torch.compile(agent.encode_step)
+    if not args.eval_only:
+        with run:  # whatever ends the training leaves its state after the last whole update
+            train(args, agent, average, optimizer, envs, run)
+    run.finish()
 
 
 if __name__ == "__main__":
-    for signum in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(signum, interrupt)
-    try:
-        main(sys.argv[1:])
-    except (evaluate.BadInput, OSError) as error:
-        fail(error)
-    except KeyboardInterrupt as error:
-        sys.exit(*error.args)
+    runs.start(main)

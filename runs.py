@@ -1,4 +1,4 @@
-"""What surrounds the learning in the ppo_gtrxl_*.py scripts: arguments, files of a run, memory, processes.
+"""What surrounds the learning in the ppo_gtrxl_*.py scripts: arguments, a run's files and messages, memory, processes.
 
 Bad input ends with one line and exit status 1.
 """
@@ -6,17 +6,22 @@ Bad input ends with one line and exit status 1.
 from __future__ import annotations
 
 import contextlib
+import copy
 import ctypes
 import importlib.util
 import io
 import json
 import os
+import signal
 import sys
+import time
 import zipfile
+from dataclasses import asdict
 from itertools import takewhile
 from pathlib import Path
 from typing import get_type_hints
 
+import gymnasium as gym
 import safetensors.torch
 import torch
 import torch.distributed as dist
@@ -33,15 +38,17 @@ RANGES = {  # lowest and highest value of every numeric flag; NaN and infinity a
     **dict.fromkeys(["total_updates", "num_envs", "num_minibatches", "update_epochs", "radius_curriculum"], (1, 10**6)),
     **dict.fromkeys(["embed_dim", "num_heads", "mlp_dim", "hidden_dim"], (1, 8192)),
     **dict.fromkeys(["learning_rate", "learning_rate_final", "clip_coef", "weight_average"], (0.0, 1.0)),
-    **dict.fromkeys(["gamma", "gae_lambda", "gae_lambda_final", "memory_noise"], (0.0, 1.0)),
+    **dict.fromkeys(["gamma", "gae_lambda", "gae_lambda_final", "memory_noise", "refine_from"], (0.0, 1.0)),
     **dict.fromkeys(["ent_coef", "ent_coef_final", "vf_coef", "mass_weight"], (0.0, 1e3)),
-    **dict.fromkeys(["reward_scale", "max_grad_norm", "target_kl", "target_kl_final"], (1e-9, 1e9)),
-    **dict.fromkeys(["log_std", "log_std_final"], (-5.0, 0.5)),
-    **{"eval_starts": (10, 10**6), "num_blocks": (1, 64), "memory_length": (0, 8192), "noise_decay": (0.1, 1.0)},
+    **dict.fromkeys(["reward_scale", "max_grad_norm", "target_kl"], (1e-9, 1e9)),
+    **dict.fromkeys(["log_std", "log_std_final"], (-8.0, 0.5)),
+    **{"eval_starts": (10, 10**6), "num_blocks": (1, 64), "memory_length": (0, 8192)},
+    **{"flights_per_start": (1, 10**6)},
 }
 CHOICES = {"action_frame": ("local", "eci"), "guidance": ("none", "linear", "knots")}
-CHOICES |= {"noise": ("learned", "schedule", "gated"), "return_norm": ("none", "time", "linear")}
-CHOICES |= {"lr_schedule": ("linear", "kl")}
+CHOICES |= {"noise": ("learned", "schedule", "gated"), "lr_schedule": ("linear", "kl")}
+NETWORK = ("num_blocks", "embed_dim", "num_heads", "memory_length", "mlp_dim", "hidden_dim")
+MAY_CHANGE_ON_RESUME = {"resume", "cuda", "num_threads"}
 
 
 def fail(message):
@@ -54,16 +61,69 @@ def refuse(name, value, allowed):
     fail(f"--{name.replace('_', '-')} {value}: {allowed}")
 
 
-def parse(kind, argv):
-    """tyro's reading of a command line into the dataclass `kind`; of its framed errors only the first paragraph."""
+def read_flags(kind, argv):
+    """The dataclass `kind` that a command line describes, and the set of fields that it names.
+
+    tyro alone knows which flags there are and what they take, but neither which of them were typed nor how to complain
+    in one line: the names are read from `argv`, and of its framed message the first paragraph is shown.
+    """
     with contextlib.redirect_stderr(io.StringIO()) as frame:
         try:
-            return tyro.cli(kind, args=argv)
+            args = tyro.cli(kind, args=argv)
         except SystemExit as stop:
             if not stop.code:  # --help
                 raise
-    lines = (line.strip("│ ") for line in frame.getvalue().splitlines() if line[:1] != "╭")
-    fail(" ".join(takewhile(lambda line: line[:1] not in ("─", "╰"), lines)) + " (--help lists what is allowed)")
+            lines = (line.strip("│ ") for line in frame.getvalue().splitlines() if line[:1] != "╭")
+            first = " ".join(takewhile(lambda line: line[:1] not in ("─", "╰"), lines))
+            fail(f"{first} (--help lists what is allowed)")
+    words = [word.split("=")[0] for word in argv if word.startswith("--")]
+    return args, {word.removeprefix("--").replace("-", "_").removeprefix("no_") for word in words}
+
+
+def parse_args(kind, argv, env_options, buffers):
+    """A script's checked arguments; with --resume the saved training state, with --checkpoint what that file holds.
+
+    kind is the script's Args, env_options the arguments that go to its environments, buffers what its agents hold by
+    environment id. SystemExit with one line that names the flag, the value and what is allowed.
+    """
+    args, typed = read_flags(kind, argv)
+    saved, env_ids = None, tuple(buffers)
+    if args.resume is not None:
+        refused = sorted(typed - MAY_CHANGE_ON_RESUME)
+        if refused:
+            refuse(refused[0], "", "only --cuda and --num-threads may be given beside --resume")
+        saved = load_state(args.resume, kind, env_ids)
+        args = kind(**{**saved["args"], **{name: getattr(args, name) for name in typed}})
+    elif args.checkpoint is not None:
+        saved = read_checkpoint(args, kind, typed, env_options, buffers)
+    elif args.eval_only:
+        refuse("checkpoint", None, "must name the agent.safetensors that --eval-only flies")
+    check(args, typed, env_ids)
+    for name in ("gae_lambda", "ent_coef"):  # a last value that is not given is the first
+        if getattr(args, f"{name}_final") is None:
+            setattr(args, f"{name}_final", getattr(args, name))
+    if args.eval_starts is None:
+        args.eval_starts = 1000 if args.eval_only else 50
+    return args, saved
+
+
+def read_checkpoint(args, kind, typed, env_options, buffers):
+    """What the file --checkpoint holds; sets the arguments that it decides, and refuses flags that contradict it.
+
+    Its environment may be another with the same buffers, and its noise is gone on with, unless a flag says otherwise.
+    """
+    decided = {name: type(getattr(kind, name)) for name in ("env_id", *env_options, *NETWORK)}
+    saved = evaluate.read_checkpoint(args.checkpoint, decided)
+    for name in decided:
+        value, given = saved["args"][name], getattr(args, name)
+        if name == "env_id" and name in typed and value != given and buffers.get(value) == buffers.get(given):
+            print(f"--checkpoint is of {value}; it goes on with {given}")
+        elif name in typed and value != given:
+            refuse(name, given, f"the checkpoint has {value}; leave the flag out")
+        else:
+            setattr(args, name, value)
+    saved["keeps_log_std"] = "log_std" not in typed
+    return saved
 
 
 def check(args, typed, env_ids):
@@ -87,20 +147,287 @@ def check(args, typed, env_ids):
             refuse(name, path, "only with --eval-only, and must be in an existing folder")
     if args.track and importlib.util.find_spec("wandb") is None:
         refuse("track", "", "needs wandb: pip install wandb")
-    processes = int(os.environ.get("WORLD_SIZE", 1))  # torchrun's: each flies its share of the environments
+    check_share(args, typed)
+
+
+def check_share(args, typed):
+    """What each of torchrun's processes flies: at least one episode a minibatch, and whole groups.
+
+    --num-minibatches and --flights-per-start are lowered where they were left alone, with a printed line.
+    """
+    processes = int(os.environ.get("WORLD_SIZE", 1))
     if args.num_envs < processes:
         refuse("num_envs", args.num_envs, f"must be at least the number of processes, {processes}")
-    if args.num_minibatches > (share := args.num_envs // processes):
-        most = f"--num-envs {args.num_envs}" + (f" / {processes} processes" if processes > 1 else "")
-        if "num_minibatches" in typed:
-            refuse("num_minibatches", args.num_minibatches, f"must be at most {most}")
-        print(f"--num-minibatches lowered from {args.num_minibatches} to {most}")
-        args.num_minibatches = share
+    share = args.num_envs // processes
+    whose = f"--num-envs {args.num_envs}" + (f" / {processes} processes" if processes > 1 else "")
+    for name in ("num_minibatches", "flights_per_start"):
+        value = getattr(args, name)
+        if value > share and name in typed:
+            refuse(name, value, f"must be at most {whose}")
+        if value > share:
+            print(f"--{name.replace('_', '-')} lowered from {value} to {whose}")
+            setattr(args, name, share)
+    if args.num_envs % (processes * args.flights_per_start):
+        refuse("flights_per_start", args.flights_per_start, f"must divide {whose}")
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Files of a run
+# Start of a script
 # ---------------------------------------------------------------------------------------------------------------------
+
+
+def start(main):
+    """Run a script's `main(argv)`: Ctrl-C and SIGTERM end it with status 130 and 143, bad input with one line and 1."""
+
+    def interrupt(signum, _):
+        raise KeyboardInterrupt(128 + signum)
+
+    for signum in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(signum, interrupt)
+    try:
+        main(sys.argv[1:])
+    except (evaluate.BadInput, OSError) as error:
+        fail(error)
+    except KeyboardInterrupt as error:
+        sys.exit(*error.args)
+
+
+def prepare_torch(args):
+    """Threads, seeds and torchrun's processes; returns the device of the networks."""
+    keep_memory()
+    torch.set_num_threads(args.num_threads or torch.get_num_threads())
+    torch.manual_seed(args.seed)
+    torch.backends.cudnn.deterministic = args.torch_deterministic
+    join_processes(args.cuda)
+    return "cuda" if torch.cuda.is_available() and args.cuda else "cpu"
+
+
+def make_envs(args, env_options):
+    """This process's share of the environments, seeded; env_options go to each."""
+    rank, processes = process()
+    share = args.num_envs // processes + (rank < args.num_envs % processes)
+    envs = gym.make_vec(args.env_id, num_envs=share, **env_options)
+    envs.reset(seed=args.seed + 2**31 * rank)
+    return envs
+
+
+def load_checkpoint(agent, args, saved):
+    """Put the weights of --checkpoint, if there is one, into a new agent; one line if they do not fit."""
+    if args.checkpoint is None or args.resume is not None:
+        return
+    try:
+        agent.load_state_dict({name: torch.from_numpy(array) for name, array in saved["tensors"].items()})
+    except (RuntimeError, TypeError) as error:
+        fail(f"--checkpoint {args.checkpoint}: its weights do not fit its own args ({error})")
+    if not saved["keeps_log_std"]:
+        torch.nn.init.constant_(agent.actor_logstd, args.log_std)
+
+
+def refuse_nan(values, epoch, minibatch):
+    """FloatingPointError that names the first of these logged tensors that is not finite, and where it was."""
+    for name, value in values.items():
+        if not value.isfinite():
+            raise FloatingPointError(f"{name} is {value} in epoch {epoch}, minibatch {minibatch}")
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# A run: its folder, counters, messages and evaluations
+# ---------------------------------------------------------------------------------------------------------------------
+
+SAVE_EVERY = 10  # updates
+TRAINING_EVAL_SEED = 2**31  # beyond --eval-seed: no reported start is flown during training
+
+
+class Run:
+    """One run: `with run:` opens its folder and keeps what was learned whatever ends the training, `end_update` counts,
+    saves, evaluates and logs, `finish` makes the reported evaluation. Under torchrun only the first process writes.
+
+    `progress` holds the counters; `training_seconds` are those of rollouts and updates, `wall_seconds` all of them.
+    """
+
+    def __init__(self, args, saved, agent, average, optimizer, envs, env_options, describe):
+        self.args, self.envs, self.env_options, self.describe = args, envs, env_options, describe
+        self.modules = {"agent": agent, "average": average, "optimizer": optimizer}
+        self.rank, _ = process()
+        self.folder, self.writer, self.metrics = None, None, {}
+        if self.rank > 0:  # the same weights, other noise
+            torch.manual_seed(args.seed + 2**31 * self.rank)
+        self.progress = {"seed": args.seed, "total_updates": 0, "global_step": 0}
+        self.progress |= {"training_seconds": 0.0, "wall_seconds": 0.0}
+        if args.resume is not None:
+            self.folder = Path(args.resume)
+            self.progress = restore(saved, self.folder, self.modules, envs)
+        elif args.eval_only:
+            self.progress = saved["progress"]
+        self.began = time.time() - self.progress["wall_seconds"]
+        self.update_began = time.time()
+
+    def __enter__(self):
+        self.state = training_state(self.args, self.modules, self.envs, self.progress)
+        if self.rank > 0:
+            return self
+        self.folder = self.folder or new_folder(f"{self.args.env_id}__{self.args.exp_name}__{self.args.seed}")
+        print(f"run folder: {self.folder}", flush=True)
+        for leftover in self.folder.glob(".*.tmp"):  # of a writer that was killed
+            leftover.unlink()
+        arguments = {**asdict(self.args), "resume": None}
+        evaluate.write_json(self.folder / "args.json", arguments)
+        if self.args.track:
+            track(self.args, self.folder.name)
+        self.writer = new_writer(self.folder, self.progress["global_step"] + 1, arguments)
+        self.save()
+        self.update_began = time.time()
+        return self
+
+    def __exit__(self, kind, error, traceback):
+        if self.writer:
+            self.writer.flush()
+        if not isinstance(error, KeyboardInterrupt | FloatingPointError):
+            return
+        self.save()
+        updates, saved = self.state["progress"]["total_updates"], self.args.save_model and self.rank == 0
+        if isinstance(error, FloatingPointError):
+            kept = f"; the last good checkpoint is {self.folder}/training_state.pt" if saved else ""
+            fail(f"update {updates + 1}: {error}, must be finite{kept}")
+        kept = f"go on with: python {self.args.exp_name}.py --resume {self.folder}" if saved else "nothing saved"
+        if self.rank == 0:
+            print(f"stopped after update {updates}; {kept}")
+
+    def save(self):
+        """Write the state after the last whole update."""
+        if self.args.save_model and self.rank == 0:
+            save_run(self.folder, self.state)
+
+    def end_update(self, iteration, alive, episodes, losses, learning_rate):
+        """Count an update; save every ten, evaluate every --eval-every, log it and now and then print a line.
+
+        alive (T, N) is the batch's, episodes the `final_info` of all, losses the means over the update.
+        """
+        args, now = self.args, time.time()
+        steps = int(total(alive.sum()))
+        self.progress = {**self.progress, "total_updates": iteration, "wall_seconds": now - self.began}
+        self.progress["global_step"] += steps
+        self.progress["training_seconds"] += now - self.update_began
+        self.state = training_state(args, self.modules, self.envs, self.progress)
+        if self.rank == 0:
+            if iteration % SAVE_EVERY == 0 or iteration == args.total_updates:
+                self.save()
+            if args.eval_every and iteration % args.eval_every == 0:
+                self.metrics, _ = self.evaluate(TRAINING_EVAL_SEED)
+                self.log("eval", self.metrics)
+            charts = {"episodic_return": episodes["episodic_return"].mean().item(), "learning_rate": learning_rate}
+            charts["episodic_length"] = steps / args.num_envs
+            charts["SPS"] = int(self.progress["global_step"] / self.progress["training_seconds"])
+            self.log("charts", charts)
+            self.log("losses", losses)
+            if iteration % (args.eval_every or max(1, args.total_updates // 100)) == 0 or iteration == 1:
+                self.print_line(episodes)
+        self.update_began = time.time()
+
+    def print_line(self, episodes):
+        """A line to follow the run by."""
+        done, of, seconds = self.progress["total_updates"], self.args.total_updates, time.time() - self.began
+        clock = f"{seconds / 60:.1f} min gone, {(of - done) * seconds / done / 60:.1f} to go"
+        line = f"update {done}/{of}, {self.progress['global_step']} steps, {clock}"
+        print(f"{line}: {self.describe(episodes, self.metrics)}", flush=True)
+
+    def log(self, prefix, values):
+        """Write every number of `values` under its TensorBoard tag."""
+        for name, value in values.items():
+            if isinstance(value, int | float):
+                self.writer.add_scalar(f"{prefix}/{name}", value, self.progress["global_step"])
+
+    def evaluate(self, eval_seed):
+        """Fly the mean action of the averaged weights and the optimum: eval.json's metrics and eval.npz's arrays."""
+        args, average = self.args, self.modules["average"].module
+        policy = average.make_policy(self.envs.episode_steps)
+        metrics, arrays = evaluate.evaluate(args.env_id, policy, eval_seed, args.eval_starts, **self.env_options)
+        device = average.actor_logstd.device.type
+        return {**metrics, **self.progress, "device": device, "torch_version": torch.__version__}, arrays
+
+    def finish(self):
+        """Fly the reported starts; write the evaluation where it was asked for, print the table."""
+        args = self.args
+        if self.rank > 0:
+            return
+        metrics, arrays = self.evaluate(args.eval_seed)
+        metrics |= evaluate.mass_reached(metrics)
+        if args.eval_only:
+            evaluate.write(metrics, arrays, args.checkpoint, args.eval_json, args.eval_npz)
+            print(evaluate.table(metrics))
+            return
+        self.log("eval", metrics)
+        self.writer.close()
+        if args.save_model:
+            paths = (self.folder / name for name in ("agent.safetensors", "eval.json", "eval.npz"))
+            evaluate.write(metrics, arrays, *paths)
+        if args.capture_video:
+            import figures
+
+            figures.draw(self.folder / "figures", arrays, metrics, evaluate.read_curve(self.folder))
+        print(evaluate.table(metrics))
+        print(f"run folder: {self.folder}")
+
+
+def new_folder(name):
+    """A new runs/{name}__{unix time}; of two runs that start within a second the later one waits for the next."""
+    while True:
+        folder = Path(f"runs/{name}__{int(time.time())}")
+        try:
+            folder.mkdir(parents=True)
+            return folder
+        except FileExistsError:
+            if not folder.is_dir():
+                raise
+            time.sleep(0.1)
+
+
+def new_writer(folder, first_step, arguments):
+    """TensorBoard's writer, with the hyperparameters as text, as CleanRL's; a resumed run drops what it does again."""
+    from torch.utils.tensorboard import SummaryWriter
+
+    writer = SummaryWriter(folder, purge_step=first_step)
+    rows = "\n".join(f"|{name}|{value}|" for name, value in arguments.items())
+    writer.add_text("hyperparameters", f"|param|value|\n|-|-|\n{rows}")
+    return writer
+
+
+def track(args, name):
+    """Follow the run with Weights and Biases."""
+    import wandb
+
+    names = {"project": args.wandb_project_name, "entity": args.wandb_entity, "name": name}
+    wandb.init(**names, sync_tensorboard=True, config=asdict(args), save_code=True)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Checkpoints
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def training_state(args, modules, envs, progress):
+    """All that a bit-exact resume needs, copied, so that training can go on while it is kept."""
+    modules = {name: module.state_dict() for name, module in modules.items()}
+    rng = {"torch": torch.get_rng_state(), "envs": json.dumps(envs.np_random.bit_generator.state)}
+    rng = gathered({**rng, "cuda": torch.cuda.get_rng_state_all()})
+    return copy.deepcopy({"args": {**asdict(args), "resume": None}, "progress": progress, "rng": rng, **modules})
+
+
+def restore(state, run_dir, modules, envs):
+    """Put everything back where `training_state` found it; returns the progress. One line if something does not fit."""
+    try:
+        for name, module in modules.items():
+            module.load_state_dict(state[name])
+        if len(state["rng"]) != process()[1]:
+            raise ValueError(f"it was trained by {len(state['rng'])} processes")
+        rng = state["rng"][process()[0]]
+        torch.set_rng_state(rng["torch"])
+        torch.cuda.set_rng_state_all(rng["cuda"][: torch.cuda.device_count()])
+        envs.np_random.bit_generator.state = json.loads(rng["envs"])
+        counters = ("seed", "total_updates", "global_step", "training_seconds", "wall_seconds")
+        return {name: state["progress"][name] for name in counters}
+    except Exception as error:  # an edited file fails in many ways, all alike to the user
+        fail(f"--resume {run_dir}: its training_state.pt does not fit its own args ({error}); it must be whole")
 
 
 def load_state(run_dir, kind, env_ids):
@@ -109,13 +436,16 @@ def load_state(run_dir, kind, env_ids):
     kind is the script's Args, env_ids its environments.
     """
     try:
-        if damaged := zipfile.ZipFile(path := Path(run_dir) / "training_state.pt").testzip():  # torch checks no CRC
+        path = Path(run_dir) / "training_state.pt"
+        damaged = zipfile.ZipFile(path).testzip()  # torch checks no CRC
+        if damaged:
             raise ValueError(f"{damaged} is damaged")
         state = torch.load(path, map_location="cpu", weights_only=True)
         args, kinds = state["args"], get_type_hints(kind)
         if args.keys() != kinds.keys() or args["env_id"] not in env_ids:
             raise ValueError("of another script")
-        if wrong := [name for name in kinds if not isinstance(args[name], kinds[name])]:
+        wrong = [name for name in kinds if not isinstance(args[name], kinds[name])]
+        if wrong:
             raise ValueError(f"{wrong[0]} is {args[wrong[0]]!r}")
     except Exception as error:  # a missing, damaged or foreign file fails in many ways, all alike to the user
         fail(f"--resume {run_dir}: must hold a training_state.pt of {kind().exp_name}.py ({error})")
@@ -174,6 +504,15 @@ def gathered(value):
     if dist.is_initialized():
         dist.all_gather_object(values, value)
     return values
+
+
+def sum_gradients(agent):
+    """Sum the gradients over all processes, in place, in one buffer: small exchanges cost their latency."""
+    if dist.is_initialized():
+        gradients = [parameter.grad for parameter in agent.parameters() if parameter.grad is not None]
+        flat = total(torch.cat([gradient.flatten() for gradient in gradients]))
+        for gradient, part in zip(gradients, flat.split([gradient.numel() for gradient in gradients])):
+            gradient.copy_(part.view_as(gradient))
 
 
 def total(x):
