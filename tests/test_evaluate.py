@@ -12,6 +12,7 @@ import pytest
 
 import envs
 import evaluate
+import figures
 
 ROOT = Path(__file__).parent.parent
 SINGLE, WAYPOINTS = "DoubleIntegrator-v0", "DoubleIntegratorWaypoints-v0"
@@ -207,7 +208,7 @@ def test_waypoints_without_a_comparable_start_have_no_ratio(why):
     text = evaluate.table(metrics)
     assert ("no start hit every circle" in text) == (why == "none hits")
     assert "No cost ratio" in text and "nan" not in text.lower()
-    assert "no cost ratio" in evaluate.headline(metrics)
+    assert "no cost ratio" in figures.headline(metrics)
 
 
 @pytest.mark.parametrize("env_id, phases", [(id_, len(problem.phases)) for id_, problem in envs.PROBLEMS.items()])
@@ -267,10 +268,13 @@ def test_missing_reference_is_solved_and_options_reach_the_environment(monkeypat
     assert set(seen) == {0.0}
 
 
-def test_import_needs_neither_torch_nor_casadi_nor_pyplot():
-    code = "import evaluate, sys; print([m for m in ('torch', 'casadi', 'matplotlib.pyplot') if m in sys.modules])"
+@pytest.mark.parametrize("module", ["envs", "baselines", "evaluate", "figures"])
+def test_import_loads_nothing_heavy(module):
+    """A training and `--help` wait for none of these; a figure needs Matplotlib, but no window."""
+    heavy = {"torch", "casadi", "scipy", "matplotlib.pyplot"} | ({"matplotlib"} if module != "figures" else set())
+    code = f"import {module}, sys; print(*{heavy} & sys.modules.keys())"
     result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert result.stdout.strip() == "[]"
+    assert result.stdout.strip() == ""
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -358,7 +362,7 @@ def test_curve_of_a_resumed_run_keeps_the_last_value(tmp_path):
 def test_figures_show_policy_optimum_targets_and_bounds():
     reference = reference_flight(WAYPOINTS, 3, 12)
     metrics, arrays = evaluate.evaluate(WAYPOINTS, feedback(WAYPOINTS, 1e3, effort=2.0), 3, 12, reference)
-    figure = evaluate.draw_trajectories(arrays, metrics)
+    figure = figures.draw_trajectories(arrays, metrics)
     plane, position, velocity, control = figure.axes
     assert [(patch.center, patch.radius) for patch in plane.patches] == [((0.0, 0.0), 0.02), ((0.5, 0.5), 0.02)]
     red = [line.get_ydata() for line in position.lines if line.get_color() == "tab:red"]
@@ -374,7 +378,7 @@ def test_cost_figure_shows_the_parts_and_marks_misses():
     policy = lets_go(feedback(WAYPOINTS, 1e3, effort=1.3), np.arange(12) == 2, 90)
     reference = reference_flight(WAYPOINTS, 3, 12)
     metrics, arrays = evaluate.evaluate(WAYPOINTS, policy, 3, 12, reference)
-    figure = evaluate.draw_costs(arrays, metrics)
+    figure = figures.draw_costs(arrays, metrics)
     panels = {ax.get_ylabel(): ax for ax in figure.axes}
     flown = envs.fly(WAYPOINTS, policy, evaluate.starts(3, 12))
     for name in ("state", "control", "terminal"):
@@ -388,7 +392,7 @@ def test_cost_figure_shows_the_parts_and_marks_misses():
 def test_median_curve_ends_with_the_shortest_seed():
     long = np.array([0, 10, 20, 30]), np.array([0.0, 1.0, 2.0, 3.0])
     short = np.array([5, 15, 25]), np.array([2.0, 4.0, 6.0])
-    grid, median = evaluate.median_curve([long, short])
+    grid, median = figures.median_curve([long, short])
     assert grid.tolist() == [10, 20]
     assert median.tolist() == [(1 + 3) / 2, (2 + 5) / 2]
 

@@ -10,6 +10,7 @@ from test_evaluate import command_line, snapshot
 
 import envs
 import evaluate
+import figures
 
 FIXED, CUTOFF = envs.ROCKETS
 MU, RE = 3.986012e14, 6378145.0
@@ -263,7 +264,7 @@ def test_hyperbola_has_no_apogee(hyperbolic, tmp_path):
     evaluate.write_json(tmp_path / "eval.json", metrics)
     (row,) = (line for line in evaluate.table(metrics).splitlines() if "apogee" in line)
     assert row.split()[-2:] == ["-", "-"]
-    figure = evaluate.draw_orbit(arrays, metrics)
+    figure = figures.draw_orbit(arrays, metrics)
     reached = lines_of(figure.axes[0])["orbit reached"]
     assert np.isnan(reached).any() and np.isfinite(reached).any()
 
@@ -276,7 +277,7 @@ def test_crash(crashed):
     table = evaluate.table(metrics)
     assert "crashed" in table and "nan" not in table and "inf" not in table
     assert table_row(table, "lowest altitude after 300 s (km)")[2:] == ["-", "-"]
-    assert "crashed" in evaluate.headline(metrics)
+    assert "crashed" in figures.headline(metrics)
 
 
 def test_missing_reference_is_asked_for_once_and_options_reach_the_environment(monkeypatch, references):
@@ -364,7 +365,7 @@ def lines_of(ax):
 
 def test_ascent_figure_shows_both_flights(flown):
     metrics, arrays = flown[CUTOFF]
-    figure = evaluate.draw_ascent(arrays, metrics)
+    figure = figures.draw_ascent(arrays, metrics)
     panels = {ax.get_ylabel(): ax for ax in figure.axes}
     assert len(panels) == len(figure.axes) == 14
     altitude, other = ([(norm(row[:3]) - RE) / 1e3 for row in arrays[key]] for key in ("y", "y_reference"))
@@ -395,7 +396,7 @@ def test_ascent_figure_shows_both_flights(flown):
 
 def test_pitch_and_yaw_are_the_programmes(flown):
     _, arrays = flown[CUTOFF]
-    pitch, yaw = evaluate.pitch_and_yaw(arrays["u"], arrays["y"])
+    pitch, yaw = figures.pitch_and_yaw(arrays["u"], arrays["y"])
     flown_pitch, flown_yaw = np.interp(arrays["t"][:-1], TIMES, BY_HAND), np.interp(arrays["t"][:-1], *WEAVE)
     assert pitch == pytest.approx(flown_pitch, abs=1e-6)
     vertical = flown_pitch > math.degrees(math.acos(0.1))
@@ -405,7 +406,7 @@ def test_pitch_and_yaw_are_the_programmes(flown):
 
 def test_orbit_figure_shows_orbits_insertion_and_ground_track(flown):
     metrics, arrays = flown[CUTOFF]
-    figure = evaluate.draw_orbit(arrays, metrics)
+    figure = figures.draw_orbit(arrays, metrics)
     plane, insertion, ground = figure.axes
     lines, frame, y = lines_of(plane), target_frame(), arrays["y"]
     target = lines["target orbit"]
@@ -414,7 +415,7 @@ def test_orbit_figure_shows_orbits_insertion_and_ground_track(flown):
     )
     assert np.ptp(target[:, 1]) == pytest.approx(2 * 24.36114 * math.sqrt(1 - 0.7308**2), rel=1e-5)
     assert lines["policy"] == pytest.approx((y[:, :3] @ frame[:2].T) / 1e6)
-    for r in evaluate.orbit_points(envs.ROCKET):  # the conic's equation: r = p - e x
+    for r in figures.orbit_points(envs.ROCKET):  # the conic's equation: r = p - e x
         assert norm(r) == pytest.approx(24361.14 * (1 - 0.7308**2) - 0.7308 * r @ frame[0])
     distance = np.hypot(*(lines["orbit reached"] - lines["policy"][-1]).T)
     assert distance.min() < 0.02  # 1000 km: it passes through the last state
@@ -444,7 +445,7 @@ def curve(level=0.0, evaluations=True):
 
 def test_training_figure_shows_the_error_and_no_outlier(flown):
     metrics, _ = flown[CUTOFF]
-    figure = evaluate.draw_training([curve(), curve(-1.0)], metrics)
+    figure = figures.draw_training([curve(), curve(-1.0)], metrics)
     returns, policy_loss, total_loss, error = figure.axes
     assert error.get_yscale() == "log" and 0.02 in [line.get_ydata()[0] for line in error.lines]
     assert "error" in error.get_ylabel()
@@ -453,12 +454,12 @@ def test_training_figure_shows_the_error_and_no_outlier(flown):
     assert policy_loss.get_title() == "" and policy_loss.get_ylim()[1] > 0.0099
     blue = [line for line in returns.lines if line.get_color() == "tab:blue"][0]
     assert blue.get_ydata()[0] == metrics["reference_episodic_return"]
-    assert len(evaluate.draw_training([curve(evaluations=False)], metrics).axes) == 3
+    assert len(figures.draw_training([curve(evaluations=False)], metrics).axes) == 3
 
 
 def test_crash_can_be_drawn(crashed):
     metrics, arrays = crashed
-    for figure in (evaluate.draw_ascent(arrays, metrics), evaluate.draw_orbit(arrays, metrics)):
+    for figure in (figures.draw_ascent(arrays, metrics), figures.draw_orbit(arrays, metrics)):
         assert "crashed" in figure.get_suptitle()
 
 
