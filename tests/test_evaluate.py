@@ -20,7 +20,8 @@ SINGLE, WAYPOINTS = "DoubleIntegrator-v0", "DoubleIntegratorWaypoints-v0"
 # INTERFACE, "eval.json": all but what the script adds (seed, checkpoint_sha256, total_updates, ...)
 COMMON = {"env_id", "eval_seed", "eval_starts", "episodic_return", "reference_episodic_return"}
 RATIOS = {"ratio_of_sums", "ratio_mean", "ratio_median", "ratio_p95", "ratio_min", "ratio_max"}
-TEN_STARTS = {"ten_start_ratio_mean_p50", "ten_start_ratio_mean_p95"}
+TEN_STARTS = {"ten_start_ratio_mean_p05", "ten_start_ratio_mean_p50", "ten_start_ratio_mean_p95"}
+NEAR = {"loss_near_origin_mean"}  # of single phases, where a start is near the origin
 COSTS = {f"{side}cost{part}_mean" for side in ("", "reference_") for part in ("", "_state", "_control", "_terminal")}
 HITS = {"hit_rate", "reference_hit_rate", "terminal_error_max", "hit_rate_phase_1"}
 ARRAYS = {"t", "x", "u", "reward", "cost", "x_reference", "u_reference", "cost_reference"}
@@ -160,6 +161,7 @@ def test_ten_start_statistic_is_the_papers():
         assert len(set(drawn)) == 10
         means.append(sum(cost[i] / optimum[i] for i in drawn) / 10)
     means.sort()
+    assert metrics["ten_start_ratio_mean_p05"] == pytest.approx(means[4] + 0.95 * (means[5] - means[4]), rel=1e-12)
     assert metrics["ten_start_ratio_mean_p50"] == pytest.approx((means[49] + means[50]) / 2, rel=1e-12)
     assert metrics["ten_start_ratio_mean_p95"] == pytest.approx(means[94] + 0.05 * (means[95] - means[94]), rel=1e-12)
     assert metrics == evaluate.ratio_metrics(cost, optimum, eval_seed=9)
@@ -167,6 +169,27 @@ def test_ten_start_statistic_is_the_papers():
     ten = evaluate.ratio_metrics(cost[:10], optimum[:10], eval_seed=9)
     assert ten["ten_start_ratio_mean_p95"] == pytest.approx(ten["ratio_mean"])  # one way only to draw ten of ten
     assert evaluate.ratio_metrics(cost[:9], optimum[:9], eval_seed=9).keys() == RATIOS
+
+
+def test_loss_near_the_origin_by_hand():
+    x0 = np.array([[0.0, 0.2], [0.12, -0.16], [0.15, 0.15], [-1.0, 0.0], [0.0, 0.0]])  # |x0| 0.2, 0.2, 0.21, 1, 0
+    cost, optimum = np.array([0.5, 0.25, 9.0, 8.0, 0.0625]), np.array([0.25, 0.125, 1.0, 1.0, 0.0])
+    expected = {"loss_near_origin_mean": (0.25 + 0.125 + 0.0625) / 3}
+    assert evaluate.near_origin_metrics(SINGLE, x0, cost, optimum) == pytest.approx(expected, rel=1e-14)
+    assert evaluate.near_origin_metrics("VanDerPol-v0", x0, cost, optimum) == pytest.approx(expected, rel=1e-14)
+    assert evaluate.near_origin_metrics(WAYPOINTS, x0, cost, optimum) == {}
+    assert evaluate.near_origin_metrics(SINGLE, x0[2:4], cost[2:4], optimum[2:4]) == {}
+
+
+def test_loss_near_the_origin_is_that_of_the_flights():
+    n = 60
+    reference = reference_flight(SINGLE, 5, n)
+    metrics, arrays = evaluate.evaluate(SINGLE, feedback(SINGLE, 0.0, effort=60.0), 5, n, reference)
+    losses = []
+    for x, ours, best in zip(arrays["x"], arrays["cost"], reference["cost"]):
+        if (x[0, 0] ** 2 + x[0, 1] ** 2) ** 0.5 <= 0.2:
+            losses.append(ours - best)
+    assert 0 < len(losses) < n and metrics["loss_near_origin_mean"] == pytest.approx(sum(losses) / len(losses))
 
 
 def test_waypoint_ratios_are_over_the_starts_that_hit_every_circle():
@@ -213,10 +236,10 @@ def test_waypoints_without_a_comparable_start_have_no_ratio(why):
 
 @pytest.mark.parametrize("env_id, phases", [(id_, len(problem.phases)) for id_, problem in envs.PROBLEMS.items()])
 def test_keys_are_exactly_the_interfaces_and_plain(env_id, phases, tmp_path):
-    reference = reference_flight(env_id, 0, 12)
+    reference = reference_flight(env_id, 5, 20)  # one start is near the origin
     effort = 150.0 if env_id == "VanDerPolWaypoints-v0" else 2.0
-    metrics, arrays = evaluate.evaluate(env_id, feedback(env_id, 1e3, effort), 0, 12, reference)
-    extra = {f"hit_rate_phase_{k}" for k in range(2, phases + 1)}
+    metrics, arrays = evaluate.evaluate(env_id, feedback(env_id, 1e3, effort), 5, 20, reference)
+    extra = {f"hit_rate_phase_{k}" for k in range(2, phases + 1)} if phases > 1 else NEAR
     assert metrics.keys() == COMMON | RATIOS | TEN_STARTS | COSTS | HITS | extra
     assert {type(value) for value in metrics.values()} == {str, int, float}
     assert all(np.isfinite(value) for value in metrics.values() if isinstance(value, float))
@@ -294,6 +317,23 @@ def test_table_shows_optimum_ours_and_ratio():
     for key in RATIOS | TEN_STARTS:
         assert f"{metrics[key]:.4f}" in text, key
     assert "eval seed 5" in text
+    (first,) = (k for k, line in enumerate(lines) if "Cost ratio" in line)
+    assert lines[first + 1].split()[:2] == ["mean", f"{metrics['ratio_mean']:.4f}:"]
+    low, high = (metrics[f"ten_start_ratio_mean_p{p}"] for p in ("05", "95"))
+    assert low < high and f"{low:.4f} to {high:.4f}" in lines[first + 2]
+    assert "near the origin" in lines[first + 3]
+    (line,) = (line for line in lines if f"p95 {metrics['ratio_p95']:.4f}" in line)
+    assert line.endswith(f"of the origin {metrics['loss_near_origin_mean']:.4f}")
+
+
+def test_table_of_an_older_evaluation_and_of_waypoints():
+    metrics, _ = evaluate.evaluate(SINGLE, feedback(SINGLE, 20.0, 2.0), 5, 20, reference_flight(SINGLE, 5, 20))
+    older = {key: value for key, value in metrics.items() if key not in NEAR | {"ten_start_ratio_mean_p05"}}
+    text = evaluate.table(older)
+    assert "draws of ten" not in text and "of the origin" not in text and f"mean {metrics['ratio_mean']:.4f}" in text
+    metrics, _ = evaluate.evaluate(WAYPOINTS, feedback(WAYPOINTS, 1e3), 5, 20, reference_flight(WAYPOINTS, 5, 20))
+    text = evaluate.table(metrics)
+    assert "near the origin" not in text and "draws of ten" in text
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), np.float64("nan")])
