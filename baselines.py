@@ -496,6 +496,16 @@ def collocate(case: Ascent, segments: int = SEGMENTS) -> dict:
     return ascend(case, collocation_mesh(case, GUESSED_TIME, segments), cold_start(case, GUESSED_TIME))
 
 
+def reached_optimum(flight: dict, rocket: Rocket = ROCKET) -> dict:
+    """The optimum, as `collocate`, for the orbit that a flight reached instead of the rocket's target orbit.
+
+    Of `flight` its five elements are read: `a_km e i_deg raan_deg argp_deg`. Raises RuntimeError where IPOPT finds no
+    optimum.
+    """
+    angles = {name: float(flight[f"{name}_deg"]) for name in ("i", "raan", "argp")}
+    return collocate(Ascent("reached", replace(rocket, a=1e3 * float(flight["a_km"]), e=float(flight["e"]), **angles)))
+
+
 def nine_pitch_angles(env_id: str, flight: dict) -> dict:
     """The opponent: a cubic spline through a flight's pitch at nine times (`PITCH_TIMES`), flown without feedback.
 

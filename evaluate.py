@@ -366,7 +366,8 @@ ROCKET_ROWS = (  # of the table: label, metric, digits
     ("perigee altitude (km)", "perigee_km", 3),
     ("apogee altitude (km)", "apogee_km", 3),
     ("final mass (kg)", "final_mass_kg", 3),
-    ("  of the optimum's", "mass_ratio", 6),
+    ("  of the optimum's for the orbit reached", "mass_ratio_reached", 6),
+    ("  of the optimum's for the target orbit", "mass_ratio", 6),
     ("final time (s)", "final_time_s", 3),
     ("maximum altitude (km)", "max_altitude_km", 3),
     ("lowest altitude after 300 s (km)", "min_altitude_after_300s_km", 3),
@@ -397,6 +398,22 @@ def rocket_metrics(flight: dict, reference: dict) -> dict:
     metrics |= {key: flight[key] for key in (*envs.RocketVectorEnv.PARTS, "points")}
     metrics = {key: float(value) for key, value in metrics.items() if np.isfinite(value)}
     return metrics | {"success": bool(flight["error_norm"] < SUCCESS), "crashed": bool(flight["crashed"])}
+
+
+def mass_reached(metrics: dict) -> dict:
+    """`mass_ratio_reached`: the final mass / the optimum's for the five elements reached, `reference_mass_reached_kg`.
+
+    `mass_ratio` compares two orbits: one a little off the target can be cheaper to reach. With cut-off and success
+    only, for it takes a solve of half a second and an orbit to solve for; without CasADi or a solution, no key.
+    """
+    options = envs.ROCKETS.get(metrics["env_id"], {"cutoff": False})
+    if not options["cutoff"] or not metrics["success"]:
+        return {}
+    try:
+        mass = float(baselines.reached_optimum(metrics)["final_mass"])
+    except (ImportError, RuntimeError):
+        return {}
+    return {"mass_ratio_reached": metrics["final_mass_kg"] / mass, "reference_mass_reached_kg": mass}
 
 
 def flight_summary(flight: dict) -> dict:
@@ -433,10 +450,13 @@ def wrapped(key: str, difference: float) -> float:
 def rocket_table(metrics: dict) -> str:
     """The table "target | optimum | ours | difference" of a rocket's evaluation; "-" where there is no number."""
     target = target_summary()
-    best = {key: metrics.get(f"reference_{key}") for _, key, _ in ROCKET_ROWS} | {"mass_ratio": 1.0}
+    best = {key: metrics.get(f"reference_{key}") for _, key, _ in ROCKET_ROWS}
+    best |= {"mass_ratio": 1.0, "mass_ratio_reached": 1.0}
     best |= {"final_mass_kg": metrics["reference_mass_kg"], "final_time_s": metrics["reference_time_s"]}
     rows = [("", "target", "optimum", "ours", "difference")]
     for label, key, digits in ROCKET_ROWS:
+        if key == "mass_ratio_reached" and key not in metrics:
+            continue
         ours, compared = metrics.get(key), target.get(key, best[key])
         cells = ["-" if v is None else f"{v:.{digits}f}" for v in (target.get(key), best[key], ours)]
         missing = ours is None or compared is None
@@ -444,25 +464,36 @@ def rocket_table(metrics: dict) -> str:
     success = ["yes" if hit else "no" for hit in (best["error_norm"] < SUCCESS, metrics["success"])]
     rows.append(("success", "-", *success, "crashed" if metrics["crashed"] else "-"))
     width = max(len(row[0]) for row in rows)
-    parts = ", ".join(f"{part} {metrics[part]:.3f}" for part in envs.RocketVectorEnv.PARTS)
+    lines = [f"{metrics['env_id']}: difference from the target, or where there is none from the optimum"]
+    lines += [f"  {row[0]:<{width}}" + "".join(f" {cell:>11}" for cell in row[1:]) for row in rows]
+    return "\n".join([*lines, *rocket_remarks(metrics)])
+
+
+def rocket_remarks(metrics: dict) -> list[str]:
+    """The lines below the rocket's table: what its numbers rest on, the return and its parts, the opponent."""
+    lines = []
+    stopped = abs(metrics.get("a_error_km", math.inf)) < 1e-3  # a crash or an empty tank may come first
+    if envs.ROCKETS[metrics["env_id"]]["cutoff"] and stopped:
+        lines.append("  With cut-off the engine stops at the target's orbital energy: a is exact because of this rule.")
+    if "mass_ratio_reached" in metrics:
+        mass = f"{metrics['reference_mass_reached_kg']:.3f} kg"
+        lines.append(f"  The optimum for the five elements reached leaves {mass}: the measure of our mass.")
     returns = f"return {metrics['episodic_return']:.3f} (the optimum's {metrics['reference_episodic_return']:.3f})"
-    return "\n".join(
-        [
-            f"{metrics['env_id']}: difference from the target, or where there is none from the optimum",
-            *(f"  {row[0]:<{width}}" + "".join(f" {cell:>11}" for cell in row[1:]) for row in rows),
-            f"  {returns}; the paper's points: {metrics['points']:.1f}",
-            f"    of it: {parts}",
-            "  Opponent, open loop: the optimum's pitch at nine times, interpolated: "
-            f"||error|| {metrics['nine_pitch_error_norm']:.6f}",
-        ]
-    )
+    lines.append(f"  {returns}; the paper's points: {metrics['points']:.1f}")
+    parts = ", ".join(f"{part} {metrics[part]:.3f}" for part in envs.RocketVectorEnv.PARTS)
+    lines.append(f"    of it: {parts}")
+    opponent = f"||error|| {metrics['nine_pitch_error_norm']:.6f}"
+    return [*lines, f"  Opponent, open loop: the optimum's pitch at nine times, interpolated: {opponent}"]
 
 
 def rocket_seed_lines(runs: list[dict]) -> list[str]:
     """`seed_lines` of two or more rocket runs: error and mass of each, and medians and ranges."""
     lines = []
     for run in runs:
-        mass = f"final mass {run['final_mass_kg']:.2f} kg ({run['mass_ratio']:.4f} of the optimum's)"
+        ratio = f"{run['mass_ratio']:.4f} of the optimum's"
+        if "mass_ratio_reached" in run:
+            ratio = f"{run['mass_ratio_reached']:.4f} of the optimum's for the orbit reached"
+        mass = f"final mass {run['final_mass_kg']:.2f} kg ({ratio})"
         lines.append(f"  seed {run['seed']}: ||error|| {run['error_norm']:.6f}, {mass}")
     errors, masses = ([run[key] for run in runs] for key in ("error_norm", "final_mass_kg"))
     spread = f"median ||error|| {np.median(errors):.6f}, {min(errors):.6f} to {max(errors):.6f}"

@@ -65,7 +65,10 @@ def headline(metrics: dict) -> str:
 def rocket_headline(metrics: dict) -> str:
     """A figure's title: error and mass."""
     crash = ", crashed" if metrics["crashed"] else ""
-    mass = f"final mass {metrics['final_mass_kg']:.1f} kg, optimum {metrics['reference_mass_kg']:.1f} kg"
+    best = f"optimum {metrics['reference_mass_kg']:.1f} kg"
+    if "mass_ratio_reached" in metrics:
+        best = f"optimum for the orbit reached {metrics['reference_mass_reached_kg']:.1f} kg"
+    mass = f"final mass {metrics['final_mass_kg']:.1f} kg, {best}"
     return f"{metrics['env_id']}: ||error|| {metrics['error_norm']:.5f}, {mass}{crash}"
 
 

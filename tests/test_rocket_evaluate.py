@@ -3,6 +3,7 @@
 import hashlib
 import json
 import math
+import sys
 
 import numpy as np
 import pytest
@@ -29,6 +30,7 @@ ARRAYS = {"t", "u", "y", "reward", "t_reference", "u_reference", "y_reference"}
 TIMES = [0, 15, 40, 75, 150, 261, 500, 800, 960]  # s
 BY_HAND = [90, 84, 68, 50, 30, 18, 4, -2, -4]  # degrees above the horizon: high, but it reaches the orbit's energy
 LOWER = [90, 82, 65, 46, 28, 18, 5, -1, -4]
+TARGET_ORBIT, REACHED = "of the optimum's for the target orbit", "of the optimum's for the orbit reached"
 WEAVE = [0, 261, 500, 961], [0, 0, 4, -4]  # s, degrees from the target plane
 
 
@@ -346,11 +348,53 @@ def test_table_shows_target_optimum_ours_and_difference(flown):
         target, *cells = table_row(table, label)
         ours, best = metrics[key], metrics[best]
         assert target == "-" and [float(c) for c in cells] == pytest.approx([best, ours, ours - best], abs=6e-4), label
-    assert float(table_row(table, "of the optimum's")[2]) == pytest.approx(metrics["mass_ratio"], abs=1e-6)
+    assert float(table_row(table, TARGET_ORBIT)[2]) == pytest.approx(metrics["mass_ratio"], abs=1e-6)
     assert table_row(table, "success")[2] == "yes"
     for key in (*PARTS, "episodic_return", "reference_episodic_return"):
         assert f"{metrics[key]:.3f}" in table, key
     assert f"{metrics['points']:.1f}" in table and "0.012300" in table.splitlines()[-1]
+
+
+def test_mass_for_the_orbit_reached(flown, monkeypatch):
+    """For the target's own elements the optimum is the known one; what is compared with it is our final mass."""
+    metrics = flown[CUTOFF][0] | TARGET
+    pytest.importorskip("casadi")
+    assert metrics["success"] and evaluate.mass_reached(metrics) == pytest.approx(
+        {"mass_ratio_reached": metrics["final_mass_kg"] / 7529.712296, "reference_mass_reached_kg": 7529.712296},
+        rel=1e-8,
+    )
+    assert evaluate.mass_reached(metrics | {"success": False}) == {}
+    assert evaluate.mass_reached(metrics | {"env_id": FIXED}) == {}
+    assert evaluate.mass_reached({"env_id": "DoubleIntegrator-v0"}) == {}
+    monkeypatch.setitem(sys.modules, "casadi", None)  # as if it were not installed
+    assert evaluate.mass_reached(metrics) == {}
+
+
+def test_an_orbit_without_an_optimum_has_no_mass_ratio(flown, monkeypatch):
+    def stop(flight):
+        raise RuntimeError("rocket ascent reached: IPOPT stopped with Infeasible_Problem_Detected")
+
+    monkeypatch.setattr(evaluate.baselines, "reached_optimum", stop)
+    assert evaluate.mass_reached(flown[CUTOFF][0]) == {}
+
+
+def test_texts_lead_with_the_mass_for_the_orbit_reached(flown, crashed, tmp_path):
+    metrics = flown[CUTOFF][0]
+    plain = evaluate.table(metrics)
+    assert REACHED not in plain and plain.count("a is exact because of this rule") == 1
+    assert "a is exact" not in evaluate.table(flown[FIXED][0]) + evaluate.table(crashed[0])
+    metrics = metrics | {"mass_ratio_reached": 0.987654, "reference_mass_reached_kg": 7654.321}
+    table = evaluate.table(metrics)
+    assert table.index(REACHED) < table.index(TARGET_ORBIT) and "7654.321 kg" in table
+    assert table_row(table, REACHED) == ["-", "1.000000", "0.987654", "-0.012346"]
+    assert float(table_row(table, TARGET_ORBIT)[2]) == pytest.approx(metrics["mass_ratio"], abs=1e-6)
+    assert figures.headline(metrics).endswith("optimum for the orbit reached 7654.3 kg")
+    (tmp_path / "seeds").mkdir()
+    for seed, run in ((1, metrics), (2, flown[CUTOFF][0])):
+        evaluate.write_json(tmp_path / "seeds" / f"{seed}.json", run | {"seed": seed})
+    first, second, _ = evaluate.seed_lines(tmp_path)
+    assert first.endswith("(0.9877 of the optimum's for the orbit reached)")
+    assert second.endswith(f"({metrics['mass_ratio']:.4f} of the optimum's)")
 
 
 # ---------------------------------------------------------------------------------------------------------------------
