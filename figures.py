@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
@@ -17,7 +18,7 @@ from matplotlib.ticker import EngFormatter
 
 import envs
 from baselines import replacing
-from evaluate import SUCCESS, altitude_km, comparable, cost_parts
+from evaluate import NEAR_ORIGIN, SUCCESS, altitude_km, comparable, cost_parts
 
 # ---------------------------------------------------------------------------------------------------------------------
 # What every problem shows: policy red, optimum blue, target green, as in the paper. Time is in s; x, u, J have no unit
@@ -34,14 +35,16 @@ BOUNDARY = {"color": "0.5", "linewidth": 0.8, "linestyle": ":"}
 def draw(folder, arrays: dict, metrics: dict, curve: dict | None = None, others=()) -> list[Path]:
     """Draw trajectories.png, costs.png and, given the run's training curve, training.png into `folder`.
 
-    Of a rocket: trajectory.png and orbit.png instead of the first two. `arrays` and `metrics` are those of `evaluate`;
-    `others` are the training curves of other seeds. Returns the paths.
+    Of a single phase also cost_error.png. Of a rocket trajectory.png and orbit.png, and none of these but training.png.
+    `arrays` and `metrics` are those of `evaluate`; `others` are the training curves of other seeds. Returns the paths.
     """
     drawn = {} if curve is None else {"training.png": draw_training([curve, *others], metrics)}
     if metrics["env_id"] in envs.ROCKETS:
         drawn |= {"trajectory.png": draw_ascent(arrays, metrics), "orbit.png": draw_orbit(arrays, metrics)}
     else:
         drawn |= {"trajectories.png": draw_trajectories(arrays, metrics), "costs.png": draw_costs(arrays, metrics)}
+        if len(envs.PROBLEMS[metrics["env_id"]].phases) == 1:  # with waypoints a missed circle would count as a gain
+            drawn |= {"cost_error.png": draw_cost_error(arrays, metrics)}
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     for name, figure in drawn.items():
@@ -207,6 +210,39 @@ def draw_bars(ax, ours: np.ndarray, optimum: np.ndarray, label: str):
     ax.bar(case + 0.2, optimum[:SHOWN], 0.4, color="tab:blue", hatch="///", edgecolor="white", label="optimum")
     ax.set(xlabel="start", ylabel=label, xticks=case)
     ax.grid(axis="y", alpha=0.3)
+
+
+SMALLEST_LOSS = 1e-6  # a smaller one is drawn as this: the optimum itself is known to about 1e-8
+
+
+def draw_cost_error(arrays: dict, metrics: dict) -> Figure:
+    """Where the policy is least optimal: J - J* over the box of the starts, and over |x0| beside J* itself.
+
+    Near the origin J* falls with |x0|^2 and the loss need not: such starts have the large ratios J / J*.
+    """
+    x0, best = arrays["x"][:, 0], arrays["cost_reference"]
+    loss, distance = np.maximum(arrays["cost"] - best, SMALLEST_LOSS), np.hypot(*x0.T)
+    figure = Figure(figsize=(12.5, 5.6), layout="constrained")
+    box, over_distance = figure.subplots(1, 2)
+    low, high = np.percentile(loss, [1, 99])
+    order = np.argsort(loss)  # the largest on top
+    style = {"s": 2000 / len(x0) ** 0.7, "cmap": "viridis_r", "norm": LogNorm(low, max(high, 2 * low))}
+    dots = box.scatter(*x0[order].T, c=loss[order], **style)
+    figure.colorbar(dots, ax=box, label="loss $J - J^*$", extend="both")
+    box.add_patch(Circle((0, 0), NEAR_ORIGIN, fill=False))
+    edge = 1.05 * envs.PROBLEMS[metrics["env_id"]].x0_max
+    box.set(xlim=(-edge, edge), ylim=(-edge, edge), aspect="equal", title=f"Loss of {len(x0)} starts")
+    box.set(xlabel="position $x_1$ of the start", ylabel="velocity $x_2$ of the start")
+    over_distance.loglog(distance, best, "x", color="tab:blue", markersize=4, alpha=0.6, label="optimum $J^*$")
+    over_distance.loglog(distance, loss, ".", color="tab:red", alpha=0.5, label="loss of the policy $J - J^*$")
+    label = f"$|x_0| = {NEAR_ORIGIN}$, the circle on the left"
+    over_distance.axvline(NEAR_ORIGIN, color="k", linewidth=1.0, label=label)
+    over_distance.set(xlabel="distance of the start from the origin $|x_0|$", ylabel="cost")
+    over_distance.set(title="Loss beside the optimum: where they meet, $J = 2 J^*$")
+    over_distance.legend(loc="upper left")
+    over_distance.grid(alpha=0.3)
+    figure.suptitle(headline(metrics))
+    return figure
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -429,6 +429,29 @@ def test_cost_figure_shows_the_parts_and_marks_misses():
     assert labels == [*expected[:2], "miss", *expected[3:]]
 
 
+@pytest.mark.parametrize("env_id", [SINGLE, "VanDerPol-v0"])
+def test_cost_error_figure_shows_every_start(env_id, tmp_path):
+    metrics, arrays = evaluate.evaluate(env_id, feedback(env_id, 20.0, 2.0), 5, 20, reference_flight(env_id, 5, 20))
+    arrays["cost"][3] = arrays["cost_reference"][3] - 1e-3  # no loss: drawn as the smallest
+    loss = [max(ours - best, 1e-6) for ours, best in zip(arrays["cost"], arrays["cost_reference"])]
+    distance = [(x[0, 0] ** 2 + x[0, 1] ** 2) ** 0.5 for x in arrays["x"]]
+    figure = figures.draw_cost_error(arrays, metrics)
+    box, over_distance, _ = figure.axes
+    dots = box.collections[0]
+    shown = sorted([*point, value] for point, value in zip(dots.get_offsets().tolist(), dots.get_array().tolist()))
+    expected = sorted([*x[0], value] for x, value in zip(arrays["x"].tolist(), loss))
+    assert np.array(shown) == pytest.approx(np.array(expected))
+    assert dots.norm(dots.get_array()).max() > dots.norm(dots.get_array()).min()
+    assert box.patches[0].radius == 0.2 and box.get_xlim()[1] > 1
+    lines = {line.get_label(): line.get_xydata() for line in over_distance.lines}
+    assert lines["optimum $J^*$"] == pytest.approx(np.c_[distance, arrays["cost_reference"]])
+    assert lines["loss of the policy $J - J^*$"] == pytest.approx(np.c_[distance, loss])
+    assert over_distance.get_xscale() == over_distance.get_yscale() == "log"
+    assert all(ax.get_xlabel() and ax.get_ylabel() for ax in (box, over_distance))
+    arrays["cost"] = arrays["cost_reference"]  # the optimum itself can be drawn, too
+    assert tmp_path / "cost_error.png" in figures.draw(tmp_path, arrays, metrics)
+
+
 def test_median_curve_ends_with_the_shortest_seed():
     long = np.array([0, 10, 20, 30]), np.array([0.0, 1.0, 2.0, 3.0])
     short = np.array([5, 15, 25]), np.array([2.0, 4.0, 6.0])
@@ -448,7 +471,7 @@ def test_publish_ships_the_first_seed_and_adds_the_second(tmp_path, monkeypatch,
     printed = command_line(monkeypatch, capsys, "publish", first, results)
     assert "ratio" in printed and SINGLE in printed
     names = {"agent.safetensors", "eval.json", "eval.npz", "seeds/1.json", "seeds/1.csv"}
-    names |= {f"figures/{name}.png" for name in ("training", "trajectories", "costs")}
+    names |= {f"figures/{name}.png" for name in ("training", "trajectories", "costs", "cost_error")}
     files = snapshot(results)
     assert {str(name) for name in files} == names
     for name in ("agent.safetensors", "eval.json", "eval.npz"):
