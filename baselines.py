@@ -7,8 +7,8 @@
     python baselines.py rocket --json results/rocket_reference.json --npz results/rocket_reference.npz
 
 Each prints mean costs over random starts and what they are compared with; the rocket has one start and five optima.
-Reading order: linear-quadratic optimum, nonlinear programs, references, the rocket's, command line. CasADi is imported
-only where a nonlinear program is built.
+Reading order: linear-quadratic optimum, nonlinear programs, references, the rocket's, command line. CasADi and SciPy
+are imported only where they are used: a training needs neither before its first evaluation.
 """
 
 from __future__ import annotations
@@ -29,8 +29,6 @@ from typing import NamedTuple
 from zipfile import BadZipFile
 
 import numpy as np
-from scipy.interpolate import CubicSpline
-from scipy.optimize import lsq_linear
 
 import envs
 from envs import DOUBLE_INTEGRATOR, PROBLEMS, ROCKET, VAN_DER_POL, Problem, Rocket, fly, rk4
@@ -86,6 +84,8 @@ def box_qp(problem: Problem, x0):
     All states are written as x = Phi x0 + Gamma u (the condensed form of model predictive control, e.g. Rawlings and
     Mayne), which leaves least squares in u within |u| <= u_max: solved by SciPy's active-set method BVLS.
     """
+    from scipy.optimize import lsq_linear
+
     (phase,), T = problem.phases, problem.steps
     A, B = linearise(problem)
     Phi, Gamma = np.zeros((T + 1, 2, 2)), np.zeros((T + 1, 2, T))
@@ -496,11 +496,23 @@ def collocate(case: Ascent, segments: int = SEGMENTS) -> dict:
     return ascend(case, collocation_mesh(case, GUESSED_TIME, segments), cold_start(case, GUESSED_TIME))
 
 
+def reached_optimum(flight: dict, rocket: Rocket = ROCKET) -> dict:
+    """The optimum, as `collocate`, for the orbit that a flight reached instead of the rocket's target orbit.
+
+    Of `flight` its five elements are read: `a_km e i_deg raan_deg argp_deg`. Raises RuntimeError where IPOPT finds no
+    optimum.
+    """
+    angles = {name: float(flight[f"{name}_deg"]) for name in ("i", "raan", "argp")}
+    return collocate(Ascent("reached", replace(rocket, a=1e3 * float(flight["a_km"]), e=float(flight["e"]), **angles)))
+
+
 def nine_pitch_angles(env_id: str, flight: dict) -> dict:
     """The opponent: a cubic spline through a flight's pitch at nine times (`PITCH_TIMES`), flown without feedback.
 
     Returns what `envs.fly_rocket` does. The times are ours: close together where the pitch turns fast.
     """
+    from scipy.interpolate import CubicSpline
+
     t, u = flight["t"], flight["u"].T
     up, along, _ = envs.local_frame(flight["y"][:-1].T, envs.target_axes()[2])
     pitch, middle = np.arctan2((u * up).sum(axis=0), (u * along).sum(axis=0)), (t[:-1] + t[1:]) / 2
@@ -514,6 +526,8 @@ def solve_ascent(key: str):
     With free final time the collocation's directions at mid-step are held over the environment's steps; with fixed time
     the program has these steps itself. Raises RuntimeError where the flight misses by more than `MISS_TOLERANCE`.
     """
+    from scipy.interpolate import CubicSpline
+
     case, begin, optimum = ASCENTS[key], time.perf_counter(), None
     rocket = case.rocket
     if case.free:

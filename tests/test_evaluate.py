@@ -12,6 +12,7 @@ import pytest
 
 import envs
 import evaluate
+import figures
 
 ROOT = Path(__file__).parent.parent
 SINGLE, WAYPOINTS = "DoubleIntegrator-v0", "DoubleIntegratorWaypoints-v0"
@@ -19,7 +20,8 @@ SINGLE, WAYPOINTS = "DoubleIntegrator-v0", "DoubleIntegratorWaypoints-v0"
 # INTERFACE, "eval.json": all but what the script adds (seed, checkpoint_sha256, total_updates, ...)
 COMMON = {"env_id", "eval_seed", "eval_starts", "episodic_return", "reference_episodic_return"}
 RATIOS = {"ratio_of_sums", "ratio_mean", "ratio_median", "ratio_p95", "ratio_min", "ratio_max"}
-TEN_STARTS = {"ten_start_ratio_mean_p50", "ten_start_ratio_mean_p95"}
+TEN_STARTS = {"ten_start_ratio_mean_p05", "ten_start_ratio_mean_p50", "ten_start_ratio_mean_p95"}
+NEAR = {"loss_near_origin_mean"}  # of single phases, where a start is near the origin
 COSTS = {f"{side}cost{part}_mean" for side in ("", "reference_") for part in ("", "_state", "_control", "_terminal")}
 HITS = {"hit_rate", "reference_hit_rate", "terminal_error_max", "hit_rate_phase_1"}
 ARRAYS = {"t", "x", "u", "reward", "cost", "x_reference", "u_reference", "cost_reference"}
@@ -159,6 +161,7 @@ def test_ten_start_statistic_is_the_papers():
         assert len(set(drawn)) == 10
         means.append(sum(cost[i] / optimum[i] for i in drawn) / 10)
     means.sort()
+    assert metrics["ten_start_ratio_mean_p05"] == pytest.approx(means[4] + 0.95 * (means[5] - means[4]), rel=1e-12)
     assert metrics["ten_start_ratio_mean_p50"] == pytest.approx((means[49] + means[50]) / 2, rel=1e-12)
     assert metrics["ten_start_ratio_mean_p95"] == pytest.approx(means[94] + 0.05 * (means[95] - means[94]), rel=1e-12)
     assert metrics == evaluate.ratio_metrics(cost, optimum, eval_seed=9)
@@ -166,6 +169,27 @@ def test_ten_start_statistic_is_the_papers():
     ten = evaluate.ratio_metrics(cost[:10], optimum[:10], eval_seed=9)
     assert ten["ten_start_ratio_mean_p95"] == pytest.approx(ten["ratio_mean"])  # one way only to draw ten of ten
     assert evaluate.ratio_metrics(cost[:9], optimum[:9], eval_seed=9).keys() == RATIOS
+
+
+def test_loss_near_the_origin_by_hand():
+    x0 = np.array([[0.0, 0.2], [0.12, -0.16], [0.15, 0.15], [-1.0, 0.0], [0.0, 0.0]])  # |x0| 0.2, 0.2, 0.21, 1, 0
+    cost, optimum = np.array([0.5, 0.25, 9.0, 8.0, 0.0625]), np.array([0.25, 0.125, 1.0, 1.0, 0.0])
+    expected = {"loss_near_origin_mean": (0.25 + 0.125 + 0.0625) / 3}
+    assert evaluate.near_origin_metrics(SINGLE, x0, cost, optimum) == pytest.approx(expected, rel=1e-14)
+    assert evaluate.near_origin_metrics("VanDerPol-v0", x0, cost, optimum) == pytest.approx(expected, rel=1e-14)
+    assert evaluate.near_origin_metrics(WAYPOINTS, x0, cost, optimum) == {}
+    assert evaluate.near_origin_metrics(SINGLE, x0[2:4], cost[2:4], optimum[2:4]) == {}
+
+
+def test_loss_near_the_origin_is_that_of_the_flights():
+    n = 60
+    reference = reference_flight(SINGLE, 5, n)
+    metrics, arrays = evaluate.evaluate(SINGLE, feedback(SINGLE, 0.0, effort=60.0), 5, n, reference)
+    losses = []
+    for x, ours, best in zip(arrays["x"], arrays["cost"], reference["cost"]):
+        if (x[0, 0] ** 2 + x[0, 1] ** 2) ** 0.5 <= 0.2:
+            losses.append(ours - best)
+    assert 0 < len(losses) < n and metrics["loss_near_origin_mean"] == pytest.approx(sum(losses) / len(losses))
 
 
 def test_waypoint_ratios_are_over_the_starts_that_hit_every_circle():
@@ -207,15 +231,15 @@ def test_waypoints_without_a_comparable_start_have_no_ratio(why):
     text = evaluate.table(metrics)
     assert ("no start hit every circle" in text) == (why == "none hits")
     assert "No cost ratio" in text and "nan" not in text.lower()
-    assert "no cost ratio" in evaluate.headline(metrics)
+    assert "no cost ratio" in figures.headline(metrics)
 
 
 @pytest.mark.parametrize("env_id, phases", [(id_, len(problem.phases)) for id_, problem in envs.PROBLEMS.items()])
 def test_keys_are_exactly_the_interfaces_and_plain(env_id, phases, tmp_path):
-    reference = reference_flight(env_id, 0, 12)
+    reference = reference_flight(env_id, 5, 20)  # one start is near the origin
     effort = 150.0 if env_id == "VanDerPolWaypoints-v0" else 2.0
-    metrics, arrays = evaluate.evaluate(env_id, feedback(env_id, 1e3, effort), 0, 12, reference)
-    extra = {f"hit_rate_phase_{k}" for k in range(2, phases + 1)}
+    metrics, arrays = evaluate.evaluate(env_id, feedback(env_id, 1e3, effort), 5, 20, reference)
+    extra = {f"hit_rate_phase_{k}" for k in range(2, phases + 1)} if phases > 1 else NEAR
     assert metrics.keys() == COMMON | RATIOS | TEN_STARTS | COSTS | HITS | extra
     assert {type(value) for value in metrics.values()} == {str, int, float}
     assert all(np.isfinite(value) for value in metrics.values() if isinstance(value, float))
@@ -267,10 +291,13 @@ def test_missing_reference_is_solved_and_options_reach_the_environment(monkeypat
     assert set(seen) == {0.0}
 
 
-def test_import_needs_neither_torch_nor_casadi_nor_pyplot():
-    code = "import evaluate, sys; print([m for m in ('torch', 'casadi', 'matplotlib.pyplot') if m in sys.modules])"
+@pytest.mark.parametrize("module", ["envs", "baselines", "evaluate", "figures"])
+def test_import_loads_nothing_heavy(module):
+    """A training and `--help` wait for none of these; a figure needs Matplotlib, but no window."""
+    heavy = {"torch", "casadi", "scipy", "matplotlib.pyplot"} | ({"matplotlib"} if module != "figures" else set())
+    code = f"import {module}, sys; print(*{heavy} & sys.modules.keys())"
     result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert result.stdout.strip() == "[]"
+    assert result.stdout.strip() == ""
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -290,6 +317,23 @@ def test_table_shows_optimum_ours_and_ratio():
     for key in RATIOS | TEN_STARTS:
         assert f"{metrics[key]:.4f}" in text, key
     assert "eval seed 5" in text
+    (first,) = (k for k, line in enumerate(lines) if "Cost ratio" in line)
+    assert lines[first + 1].split()[:2] == ["mean", f"{metrics['ratio_mean']:.4f}:"]
+    low, high = (metrics[f"ten_start_ratio_mean_p{p}"] for p in ("05", "95"))
+    assert low < high and f"{low:.4f} to {high:.4f}" in lines[first + 2]
+    assert "near the origin" in lines[first + 3]
+    (line,) = (line for line in lines if f"p95 {metrics['ratio_p95']:.4f}" in line)
+    assert line.endswith(f"of the origin {metrics['loss_near_origin_mean']:.4f}")
+
+
+def test_table_of_an_older_evaluation_and_of_waypoints():
+    metrics, _ = evaluate.evaluate(SINGLE, feedback(SINGLE, 20.0, 2.0), 5, 20, reference_flight(SINGLE, 5, 20))
+    older = {key: value for key, value in metrics.items() if key not in NEAR | {"ten_start_ratio_mean_p05"}}
+    text = evaluate.table(older)
+    assert "draws of ten" not in text and "of the origin" not in text and f"mean {metrics['ratio_mean']:.4f}" in text
+    metrics, _ = evaluate.evaluate(WAYPOINTS, feedback(WAYPOINTS, 1e3), 5, 20, reference_flight(WAYPOINTS, 5, 20))
+    text = evaluate.table(metrics)
+    assert "near the origin" not in text and "draws of ten" in text
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), np.float64("nan")])
@@ -358,7 +402,7 @@ def test_curve_of_a_resumed_run_keeps_the_last_value(tmp_path):
 def test_figures_show_policy_optimum_targets_and_bounds():
     reference = reference_flight(WAYPOINTS, 3, 12)
     metrics, arrays = evaluate.evaluate(WAYPOINTS, feedback(WAYPOINTS, 1e3, effort=2.0), 3, 12, reference)
-    figure = evaluate.draw_trajectories(arrays, metrics)
+    figure = figures.draw_trajectories(arrays, metrics)
     plane, position, velocity, control = figure.axes
     assert [(patch.center, patch.radius) for patch in plane.patches] == [((0.0, 0.0), 0.02), ((0.5, 0.5), 0.02)]
     red = [line.get_ydata() for line in position.lines if line.get_color() == "tab:red"]
@@ -374,7 +418,7 @@ def test_cost_figure_shows_the_parts_and_marks_misses():
     policy = lets_go(feedback(WAYPOINTS, 1e3, effort=1.3), np.arange(12) == 2, 90)
     reference = reference_flight(WAYPOINTS, 3, 12)
     metrics, arrays = evaluate.evaluate(WAYPOINTS, policy, 3, 12, reference)
-    figure = evaluate.draw_costs(arrays, metrics)
+    figure = figures.draw_costs(arrays, metrics)
     panels = {ax.get_ylabel(): ax for ax in figure.axes}
     flown = envs.fly(WAYPOINTS, policy, evaluate.starts(3, 12))
     for name in ("state", "control", "terminal"):
@@ -385,10 +429,33 @@ def test_cost_figure_shows_the_parts_and_marks_misses():
     assert labels == [*expected[:2], "miss", *expected[3:]]
 
 
+@pytest.mark.parametrize("env_id", [SINGLE, "VanDerPol-v0"])
+def test_cost_error_figure_shows_every_start(env_id, tmp_path):
+    metrics, arrays = evaluate.evaluate(env_id, feedback(env_id, 20.0, 2.0), 5, 20, reference_flight(env_id, 5, 20))
+    arrays["cost"][3] = arrays["cost_reference"][3] - 1e-3  # no loss: drawn as the smallest
+    loss = [max(ours - best, 1e-6) for ours, best in zip(arrays["cost"], arrays["cost_reference"])]
+    distance = [(x[0, 0] ** 2 + x[0, 1] ** 2) ** 0.5 for x in arrays["x"]]
+    figure = figures.draw_cost_error(arrays, metrics)
+    box, over_distance, _ = figure.axes
+    dots = box.collections[0]
+    shown = sorted([*point, value] for point, value in zip(dots.get_offsets().tolist(), dots.get_array().tolist()))
+    expected = sorted([*x[0], value] for x, value in zip(arrays["x"].tolist(), loss))
+    assert np.array(shown) == pytest.approx(np.array(expected))
+    assert dots.norm(dots.get_array()).max() > dots.norm(dots.get_array()).min()
+    assert box.patches[0].radius == 0.2 and box.get_xlim()[1] > 1
+    lines = {line.get_label(): line.get_xydata() for line in over_distance.lines}
+    assert lines["optimum $J^*$"] == pytest.approx(np.c_[distance, arrays["cost_reference"]])
+    assert lines["loss of the policy $J - J^*$"] == pytest.approx(np.c_[distance, loss])
+    assert over_distance.get_xscale() == over_distance.get_yscale() == "log"
+    assert all(ax.get_xlabel() and ax.get_ylabel() for ax in (box, over_distance))
+    arrays["cost"] = arrays["cost_reference"]  # the optimum itself can be drawn, too
+    assert tmp_path / "cost_error.png" in figures.draw(tmp_path, arrays, metrics)
+
+
 def test_median_curve_ends_with_the_shortest_seed():
     long = np.array([0, 10, 20, 30]), np.array([0.0, 1.0, 2.0, 3.0])
     short = np.array([5, 15, 25]), np.array([2.0, 4.0, 6.0])
-    grid, median = evaluate.median_curve([long, short])
+    grid, median = figures.median_curve([long, short])
     assert grid.tolist() == [10, 20]
     assert median.tolist() == [(1 + 3) / 2, (2 + 5) / 2]
 
@@ -404,7 +471,7 @@ def test_publish_ships_the_first_seed_and_adds_the_second(tmp_path, monkeypatch,
     printed = command_line(monkeypatch, capsys, "publish", first, results)
     assert "ratio" in printed and SINGLE in printed
     names = {"agent.safetensors", "eval.json", "eval.npz", "seeds/1.json", "seeds/1.csv"}
-    names |= {f"figures/{name}.png" for name in ("training", "trajectories", "costs")}
+    names |= {f"figures/{name}.png" for name in ("training", "trajectories", "costs", "cost_error")}
     files = snapshot(results)
     assert {str(name) for name in files} == names
     for name in ("agent.safetensors", "eval.json", "eval.npz"):

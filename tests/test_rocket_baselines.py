@@ -94,6 +94,14 @@ def test_solving_twice_gives_the_same_bits(command):
     np.testing.assert_array_equal(flight["u"], arrays["free_u"])
 
 
+def test_optimum_for_the_orbit_reached():
+    """For the target's own elements it is the known optimum; a lower apogee, with the same perigee, leaves more."""
+    elements = {"a_km": 24361.14, "e": 0.7308, "i_deg": 28.5, "raan_deg": 269.8, "argp_deg": 130.5}
+    assert baselines.reached_optimum(elements)["final_mass"] == pytest.approx(7529.712296, rel=1e-8)
+    lower = elements | {"a_km": 24361.14 - 100, "e": 1 - 24361.14 * (1 - 0.7308) / (24361.14 - 100)}
+    assert 7530 < baselines.reached_optimum(lower)["final_mass"] < 7550
+
+
 # --- flights ----------------------------------------------------------------------------------------------------------
 
 

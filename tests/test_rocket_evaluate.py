@@ -3,6 +3,7 @@
 import hashlib
 import json
 import math
+import sys
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from test_evaluate import command_line, snapshot
 
 import envs
 import evaluate
+import figures
 
 FIXED, CUTOFF = envs.ROCKETS
 MU, RE = 3.986012e14, 6378145.0
@@ -28,6 +30,7 @@ ARRAYS = {"t", "u", "y", "reward", "t_reference", "u_reference", "y_reference"}
 TIMES = [0, 15, 40, 75, 150, 261, 500, 800, 960]  # s
 BY_HAND = [90, 84, 68, 50, 30, 18, 4, -2, -4]  # degrees above the horizon: high, but it reaches the orbit's energy
 LOWER = [90, 82, 65, 46, 28, 18, 5, -1, -4]
+TARGET_ORBIT, REACHED = "of the optimum's for the target orbit", "of the optimum's for the orbit reached"
 WEAVE = [0, 261, 500, 961], [0, 0, 4, -4]  # s, degrees from the target plane
 
 
@@ -263,7 +266,7 @@ def test_hyperbola_has_no_apogee(hyperbolic, tmp_path):
     evaluate.write_json(tmp_path / "eval.json", metrics)
     (row,) = (line for line in evaluate.table(metrics).splitlines() if "apogee" in line)
     assert row.split()[-2:] == ["-", "-"]
-    figure = evaluate.draw_orbit(arrays, metrics)
+    figure = figures.draw_orbit(arrays, metrics)
     reached = lines_of(figure.axes[0])["orbit reached"]
     assert np.isnan(reached).any() and np.isfinite(reached).any()
 
@@ -276,7 +279,7 @@ def test_crash(crashed):
     table = evaluate.table(metrics)
     assert "crashed" in table and "nan" not in table and "inf" not in table
     assert table_row(table, "lowest altitude after 300 s (km)")[2:] == ["-", "-"]
-    assert "crashed" in evaluate.headline(metrics)
+    assert "crashed" in figures.headline(metrics)
 
 
 def test_missing_reference_is_asked_for_once_and_options_reach_the_environment(monkeypatch, references):
@@ -345,11 +348,53 @@ def test_table_shows_target_optimum_ours_and_difference(flown):
         target, *cells = table_row(table, label)
         ours, best = metrics[key], metrics[best]
         assert target == "-" and [float(c) for c in cells] == pytest.approx([best, ours, ours - best], abs=6e-4), label
-    assert float(table_row(table, "of the optimum's")[2]) == pytest.approx(metrics["mass_ratio"], abs=1e-6)
+    assert float(table_row(table, TARGET_ORBIT)[2]) == pytest.approx(metrics["mass_ratio"], abs=1e-6)
     assert table_row(table, "success")[2] == "yes"
     for key in (*PARTS, "episodic_return", "reference_episodic_return"):
         assert f"{metrics[key]:.3f}" in table, key
     assert f"{metrics['points']:.1f}" in table and "0.012300" in table.splitlines()[-1]
+
+
+def test_mass_for_the_orbit_reached(flown, monkeypatch):
+    """For the target's own elements the optimum is the known one; what is compared with it is our final mass."""
+    metrics = flown[CUTOFF][0] | TARGET
+    pytest.importorskip("casadi")
+    assert metrics["success"] and evaluate.mass_reached(metrics) == pytest.approx(
+        {"mass_ratio_reached": metrics["final_mass_kg"] / 7529.712296, "reference_mass_reached_kg": 7529.712296},
+        rel=1e-8,
+    )
+    assert evaluate.mass_reached(metrics | {"success": False}) == {}
+    assert evaluate.mass_reached(metrics | {"env_id": FIXED}) == {}
+    assert evaluate.mass_reached({"env_id": "DoubleIntegrator-v0"}) == {}
+    monkeypatch.setitem(sys.modules, "casadi", None)  # as if it were not installed
+    assert evaluate.mass_reached(metrics) == {}
+
+
+def test_an_orbit_without_an_optimum_has_no_mass_ratio(flown, monkeypatch):
+    def stop(flight):
+        raise RuntimeError("rocket ascent reached: IPOPT stopped with Infeasible_Problem_Detected")
+
+    monkeypatch.setattr(evaluate.baselines, "reached_optimum", stop)
+    assert evaluate.mass_reached(flown[CUTOFF][0]) == {}
+
+
+def test_texts_lead_with_the_mass_for_the_orbit_reached(flown, crashed, tmp_path):
+    metrics = flown[CUTOFF][0]
+    plain = evaluate.table(metrics)
+    assert REACHED not in plain and plain.count("a is exact because of this rule") == 1
+    assert "a is exact" not in evaluate.table(flown[FIXED][0]) + evaluate.table(crashed[0])
+    metrics = metrics | {"mass_ratio_reached": 0.987654, "reference_mass_reached_kg": 7654.321}
+    table = evaluate.table(metrics)
+    assert table.index(REACHED) < table.index(TARGET_ORBIT) and "7654.321 kg" in table
+    assert table_row(table, REACHED) == ["-", "1.000000", "0.987654", "-0.012346"]
+    assert float(table_row(table, TARGET_ORBIT)[2]) == pytest.approx(metrics["mass_ratio"], abs=1e-6)
+    assert figures.headline(metrics).endswith("optimum for the orbit reached 7654.3 kg")
+    (tmp_path / "seeds").mkdir()
+    for seed, run in ((1, metrics), (2, flown[CUTOFF][0])):
+        evaluate.write_json(tmp_path / "seeds" / f"{seed}.json", run | {"seed": seed})
+    first, second, _ = evaluate.seed_lines(tmp_path)
+    assert first.endswith("(0.9877 of the optimum's for the orbit reached)")
+    assert second.endswith(f"({metrics['mass_ratio']:.4f} of the optimum's)")
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -364,7 +409,7 @@ def lines_of(ax):
 
 def test_ascent_figure_shows_both_flights(flown):
     metrics, arrays = flown[CUTOFF]
-    figure = evaluate.draw_ascent(arrays, metrics)
+    figure = figures.draw_ascent(arrays, metrics)
     panels = {ax.get_ylabel(): ax for ax in figure.axes}
     assert len(panels) == len(figure.axes) == 14
     altitude, other = ([(norm(row[:3]) - RE) / 1e3 for row in arrays[key]] for key in ("y", "y_reference"))
@@ -395,7 +440,7 @@ def test_ascent_figure_shows_both_flights(flown):
 
 def test_pitch_and_yaw_are_the_programmes(flown):
     _, arrays = flown[CUTOFF]
-    pitch, yaw = evaluate.pitch_and_yaw(arrays["u"], arrays["y"])
+    pitch, yaw = figures.pitch_and_yaw(arrays["u"], arrays["y"])
     flown_pitch, flown_yaw = np.interp(arrays["t"][:-1], TIMES, BY_HAND), np.interp(arrays["t"][:-1], *WEAVE)
     assert pitch == pytest.approx(flown_pitch, abs=1e-6)
     vertical = flown_pitch > math.degrees(math.acos(0.1))
@@ -405,7 +450,7 @@ def test_pitch_and_yaw_are_the_programmes(flown):
 
 def test_orbit_figure_shows_orbits_insertion_and_ground_track(flown):
     metrics, arrays = flown[CUTOFF]
-    figure = evaluate.draw_orbit(arrays, metrics)
+    figure = figures.draw_orbit(arrays, metrics)
     plane, insertion, ground = figure.axes
     lines, frame, y = lines_of(plane), target_frame(), arrays["y"]
     target = lines["target orbit"]
@@ -414,7 +459,7 @@ def test_orbit_figure_shows_orbits_insertion_and_ground_track(flown):
     )
     assert np.ptp(target[:, 1]) == pytest.approx(2 * 24.36114 * math.sqrt(1 - 0.7308**2), rel=1e-5)
     assert lines["policy"] == pytest.approx((y[:, :3] @ frame[:2].T) / 1e6)
-    for r in evaluate.orbit_points(envs.ROCKET):  # the conic's equation: r = p - e x
+    for r in figures.orbit_points(envs.ROCKET):  # the conic's equation: r = p - e x
         assert norm(r) == pytest.approx(24361.14 * (1 - 0.7308**2) - 0.7308 * r @ frame[0])
     distance = np.hypot(*(lines["orbit reached"] - lines["policy"][-1]).T)
     assert distance.min() < 0.02  # 1000 km: it passes through the last state
@@ -444,7 +489,7 @@ def curve(level=0.0, evaluations=True):
 
 def test_training_figure_shows_the_error_and_no_outlier(flown):
     metrics, _ = flown[CUTOFF]
-    figure = evaluate.draw_training([curve(), curve(-1.0)], metrics)
+    figure = figures.draw_training([curve(), curve(-1.0)], metrics)
     returns, policy_loss, total_loss, error = figure.axes
     assert error.get_yscale() == "log" and 0.02 in [line.get_ydata()[0] for line in error.lines]
     assert "error" in error.get_ylabel()
@@ -453,12 +498,12 @@ def test_training_figure_shows_the_error_and_no_outlier(flown):
     assert policy_loss.get_title() == "" and policy_loss.get_ylim()[1] > 0.0099
     blue = [line for line in returns.lines if line.get_color() == "tab:blue"][0]
     assert blue.get_ydata()[0] == metrics["reference_episodic_return"]
-    assert len(evaluate.draw_training([curve(evaluations=False)], metrics).axes) == 3
+    assert len(figures.draw_training([curve(evaluations=False)], metrics).axes) == 3
 
 
 def test_crash_can_be_drawn(crashed):
     metrics, arrays = crashed
-    for figure in (evaluate.draw_ascent(arrays, metrics), evaluate.draw_orbit(arrays, metrics)):
+    for figure in (figures.draw_ascent(arrays, metrics), figures.draw_orbit(arrays, metrics)):
         assert "crashed" in figure.get_suptitle()
 
 
