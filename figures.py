@@ -249,7 +249,7 @@ def draw_cost_error(arrays: dict, metrics: dict) -> Figure:
 # Rocket ascent
 # ---------------------------------------------------------------------------------------------------------------------
 
-ALTITUDE_LIMIT = 250.0  # km, the paper's
+ALTITUDE_LIMIT = 250.0  # km, beyond which the paper penalises an overshoot
 DASHED = {"linewidth": 1.4, "linestyle": (0, (6, 5))}  # one line a panel: gaps that show the other line beneath
 OURS, BEST = {**POLICY, "linewidth": 2.2}, {**OPTIMUM, **DASHED}
 # velocities share a panel with positions: the same widths and dashes, paler
