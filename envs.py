@@ -1,4 +1,4 @@
-"""Dynamics, problem tables and environments: one batched code for the single and the vector environment.
+"""Problems and environments: one batched code for the single and the vector environment.
 
 Importing this module registers (section "Numerical Simulations" of the paper; the last, with free final time, is ours)
 
@@ -6,7 +6,9 @@ Importing this module registers (section "Numerical Simulations" of the paper; t
     RocketAscent-v0  RocketAscentCutoff-v0
 
 `gymnasium.make(id)` gives one environment, `gymnasium.make_vec(id, num_envs=N)` N of them, stepped together in float64
-NumPy with no Python loop over environments. Reading order: problem tables, dynamics, environments, registration.
+NumPy with no Python loop over environments. Vehicle, equations of motion and rewards of the rocket are in `rocket.py`,
+best read before `RocketVectorEnv`; all its names are also this module's. Reading order: dynamics and tables of the
+small problems, the batch that every environment is, theirs, the single environment, the rocket's, registration.
 To add a problem of this kind: write its dynamics, its table, and one line in `PROBLEMS`.
 """
 
@@ -14,7 +16,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -22,6 +23,34 @@ from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
+
+from rocket import (  # noqa: F401 - every name of rocket.py is also one of envs.py
+    BOOSTER,
+    G0,
+    REFERENCE_PITCH,
+    ROCKET,
+    STAGE_1,
+    STAGE_2,
+    TERMINAL_SCALE,
+    Burn,
+    Engine,
+    OrbitalElements,
+    Rocket,
+    ascent,
+    guidance_reward,
+    local_frame,
+    orbit_vectors,
+    orbital_elements,
+    orbital_reward,
+    penalties,
+    precision_points,
+    specific_energy,
+    target_axes,
+    target_orbit,
+    terminal_error,
+    terminal_reward,
+    trajectory_reward,
+)
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Dynamics: x is a tuple of components, each a NumPy array over environments or a CasADi symbol
@@ -387,320 +416,11 @@ def fly(env_id: str, policy: Callable, x0, **options) -> dict:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Rocket ascent: vehicle, Earth and target (the paper's table "Vehicle Properties and Simulation Parameters", and where
-# it rounds or has no row the constants of the GPOPS-II benchmark that it is adapted from)
-# ---------------------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Engine:
-    """One row block of the table: a solid booster or a stage."""
-
-    total_mass: float  # kg
-    propellant: float  # kg
-    thrust: float  # N
-    isp: float  # s, the table's, which its propellant, thrust and burn time contradict (stage 2: 467.2 s)
-    burn_time: float  # s
-
-    def flow(self, table_isp: bool) -> float:
-        """Propellant flow in kg/s: propellant / burn time (the GPOPS-II benchmark's), or T / (g0 Isp) of the table."""
-        return self.thrust / (G0 * self.isp) if table_isp else self.propellant / self.burn_time
-
-
-@dataclass(frozen=True)
-class Burn:
-    """A phase: the engines that burn until `end` and those whose dry mass is dropped then, as (number, engine)."""
-
-    end: float  # s
-    engines: tuple[tuple[int, Engine], ...]
-    dropped: tuple[tuple[int, Engine], ...] = ()
-
-    @property
-    def thrust(self) -> float:
-        """N."""
-        return sum(n * engine.thrust for n, engine in self.engines)
-
-    def flow(self, table_isp: bool) -> float:
-        """kg/s."""
-        return sum(n * engine.flow(table_isp) for n, engine in self.engines)
-
-    @property
-    def jettison(self) -> float:
-        """kg; propellant that did not burn stays on board."""
-        return sum(n * (engine.total_mass - engine.propellant) for n, engine in self.dropped)
-
-
-class OrbitalElements(NamedTuple):
-    """Keplerian elements, each an array over the states."""
-
-    a: np.ndarray  # semi-major axis, m (negative on a hyperbola, infinite on a parabola)
-    e: np.ndarray  # eccentricity
-    i: np.ndarray  # inclination, rad, 0..pi
-    raan: np.ndarray  # right ascension of the ascending node, rad, 0..2 pi; 0 on an equatorial orbit
-    argp: np.ndarray  # argument of perigee, rad, 0..2 pi; 0 on a circular orbit
-
-
-G0 = 9.80665  # m/s^2
-BOOSTER = Engine(total_mass=19290.0, propellant=17010.0, thrust=628500.0, isp=284.0, burn_time=75.2)
-STAGE_1 = Engine(total_mass=104380.0, propellant=95550.0, thrust=1083100.0, isp=301.7, burn_time=261.0)
-STAGE_2 = Engine(total_mass=19300.0, propellant=16820.0, thrust=110094.0, isp=462.4, burn_time=700.0)
-
-
-@dataclass(frozen=True)
-class Rocket:
-    """The paper's rocket, Earth and target. A vehicle of your own is `dataclasses.replace(ROCKET, ...)`."""
-
-    burns: tuple[Burn, ...] = (
-        Burn(75.2, ((6, BOOSTER), (1, STAGE_1)), dropped=((6, BOOSTER),)),
-        Burn(150.4, ((3, BOOSTER), (1, STAGE_1)), dropped=((3, BOOSTER),)),
-        Burn(261.0, ((1, STAGE_1),), dropped=((1, STAGE_1),)),
-        Burn(961.0, ((1, STAGE_2),)),
-    )
-    payload: float = 4164.0  # kg
-    mu: float = 3.986012e14  # m^3/s^2
-    Re: float = 6378145.0  # m
-    omega_e: float = 7.29211585e-5  # rad/s
-    rho0: float = 1.225  # kg/m^3
-    H: float = 7200.0  # m
-    Cd: float = 0.5
-    S: float = 4 * np.pi  # m^2
-    latitude: float = 28.5  # degrees, by our reading geocentric; the longitude is 0 (ours)
-    a: float = 24361140.0  # m, target orbit
-    e: float = 0.7308
-    i: float = 28.5  # degrees
-    raan: float = 269.8  # degrees
-    argp: float = 130.5  # degrees
-    dt: float = 2.0  # s
-    end_time: float = 961.0  # s
-    table_isp: bool = False
-
-    @property
-    def x0(self) -> np.ndarray:
-        """The start (7,): r (m) and v (m/s) in ECI, at rest on the ground, and the mass (kg) of all that is dropped, of
-        the last stage and of the payload."""
-        latitude = np.radians(self.latitude)
-        r = self.Re * np.array([np.cos(latitude), 0.0, np.sin(latitude)])
-        parts = [*(part for burn in self.burns for part in burn.dropped), *self.burns[-1].engines]
-        mass = self.payload + sum(n * engine.total_mass for n, engine in parts)
-        return np.array([*r, 0.0, self.omega_e * r[0], 0.0, mass])
-
-    @property
-    def dry_mass(self) -> float:
-        """kg: what is left when the last stage has burnt all its propellant, the payload included."""
-        last_stage = self.burns[-1].engines
-        return self.payload + sum(n * (engine.total_mass - engine.propellant) for n, engine in last_stage)
-
-    @property
-    def target(self) -> OrbitalElements:
-        """The target orbit's elements in m and rad."""
-        return OrbitalElements(self.a, self.e, *np.radians([self.i, self.raan, self.argp]))
-
-    @property
-    def target_energy(self) -> float:
-        """Specific energy of the target orbit, -mu / (2 a), in J/kg."""
-        return -self.mu / (2 * self.a)
-
-    def arcs(self) -> list[tuple[float, float, float, float, float]]:
-        """What is constant between events: (start s, end s, thrust N, flow kg/s, kg dropped at the end), in order.
-
-        A last stage that runs dry before its phase ends gives an arc of its own without thrust.
-        """
-        arcs, start = [], 0.0
-        for burn in self.burns:
-            flow = burn.flow(self.table_isp)
-            dry = start + sum(n * engine.propellant for n, engine in burn.engines) / flow
-            if burn is self.burns[-1] and dry < burn.end - 1e-6:  # rounding alone is not an event
-                arcs.append((start, dry, burn.thrust, flow, 0.0))
-                start, flow = dry, 0.0
-            arcs.append((start, burn.end, burn.thrust if flow else 0.0, flow, burn.jettison))
-            start = burn.end
-        return arcs
-
-
-ROCKET = Rocket()
-
-
-def ascent(x, u, rocket: Rocket = ROCKET):
-    """r' = v, v' = -mu r / |r|^3 + T u / m + D / m, m' = -flow ("Multiphase Rocket Ascent Problem").
-
-    D = -1/2 rho Cd S |v_rel| v_rel, rho = rho0 exp(-h / H), v_rel = v - omega_e x r. x: r, v, m by components; u: the
-    unit thrust direction by components, thrust T (N) and propellant flow (kg/s). The paper's drag acts "during
-    atmospheric phases", this one always: it fades with the density.
-    """
-    rx, ry, rz, vx, vy, vz, m = x
-    ux, uy, uz, thrust, flow = u
-    r2 = rx * rx + ry * ry + rz * rz
-    r = r2**0.5
-    gravity, push = -rocket.mu / (r2 * r), thrust / m
-    wx, wy = vx + rocket.omega_e * ry, vy - rocket.omega_e * rx  # v_rel; its third component is vz
-    rho = rocket.rho0 * np.exp((rocket.Re - r) / rocket.H)
-    drag = (-0.5 * rocket.Cd * rocket.S) * rho * (wx * wx + wy * wy + vz * vz) ** 0.5 / m
-    ax = gravity * rx + push * ux + drag * wx
-    ay = gravity * ry + push * uy + drag * wy
-    az = gravity * rz + push * uz + drag * vz
-    return vx, vy, vz, ax, ay, az, -flow
-
-
-def orbit_vectors(x, mu: float = ROCKET.mu):
-    """Angular momentum h = r x v and eccentricity vector e = v x h / mu - r / |r|, each a tuple of components."""
-    rx, ry, rz, vx, vy, vz = x[:6]
-    hx, hy, hz = ry * vz - rz * vy, rz * vx - rx * vz, rx * vy - ry * vx
-    r = (rx * rx + ry * ry + rz * rz) ** 0.5
-    ex, ey, ez = (vy * hz - vz * hy) / mu - rx / r, (vz * hx - vx * hz) / mu - ry / r, (vx * hy - vy * hx) / mu - rz / r
-    return (hx, hy, hz), (ex, ey, ez)
-
-
-def specific_energy(x, mu: float = ROCKET.mu):
-    """|v|^2 / 2 - mu / |r|, in J/kg, of a state by components."""
-    rx, ry, rz, vx, vy, vz = x[:6]
-    return (vx * vx + vy * vy + vz * vz) / 2 - mu / (rx * rx + ry * ry + rz * rz) ** 0.5
-
-
-def orbital_elements(state, mu: float = ROCKET.mu) -> OrbitalElements:
-    """Keplerian elements of states (..., 6 or more: r in m, v in m/s), each (...,); e.g. Vallado, algorithm 9 (RV2COE).
-
-    Where an angle has no meaning it is 0: the node of an equatorial orbit (the perigee is then counted from the x axis,
-    in the direction of flight), the perigee of a circular one. |r| must be positive.
-    """
-    x = np.moveaxis(np.asarray(state, dtype=np.float64), -1, 0)
-    h, e = (np.array(vector) for vector in orbit_vectors(x, mu))
-    energy = specific_energy(x, mu)
-    a = np.divide(-mu, 2 * energy, out=np.full(energy.shape, np.inf), where=energy != 0)
-    equatorial, eccentricity = (h[0] == 0) & (h[1] == 0), np.sqrt((e * e).sum(axis=0))
-    node = np.where(equatorial, 1.0, -h[1]), np.where(equatorial, 0.0, h[0])  # z x h, of any length
-    i = np.arctan2(np.hypot(h[0], h[1]), h[2])
-    along = node[0] * e[0] + node[1] * e[1]
-    # e . (h x node), in units of |h|: the component of e a right angle ahead of the node
-    ahead = e[0] * -h[2] * node[1] + e[1] * h[2] * node[0] + e[2] * (h[0] * node[1] - h[1] * node[0])
-    argp = np.arctan2(ahead, along * np.sqrt((h * h).sum(axis=0)))
-    circular = eccentricity < 1e-14
-    raan, argp = np.arctan2(node[1], node[0]) % (2 * np.pi), np.where(circular, 0.0, argp % (2 * np.pi))
-    return OrbitalElements(a, eccentricity, i, raan, argp)
-
-
-def target_orbit(elements: OrbitalElements = ROCKET.target, mu: float = ROCKET.mu):
-    """Angular momentum (..., 3), m^2/s, and eccentricity vector (..., 3) of orbits given by their elements (m, rad)."""
-    a, e, i, raan, argp = (np.asarray(element, dtype=np.float64) for element in elements)
-    normal = np.stack([np.sin(raan) * np.sin(i), -np.cos(raan) * np.sin(i), np.cos(i)], axis=-1)
-    perigee = [
-        np.cos(raan) * np.cos(argp) - np.sin(raan) * np.sin(argp) * np.cos(i),
-        np.sin(raan) * np.cos(argp) + np.cos(raan) * np.sin(argp) * np.cos(i),
-        np.sin(argp) * np.sin(i),
-    ]
-    return np.sqrt(mu * a * (1 - e * e))[..., None] * normal, e[..., None] * np.stack(perigee, axis=-1)
-
-
-def target_axes(rocket: Rocket = ROCKET) -> np.ndarray:
-    """Rows: perigee direction, semi-latus direction, plane normal of the target orbit, (3, 3), unit vectors in ECI."""
-    h, e = target_orbit(rocket.target, rocket.mu)
-    normal, perigee = h / np.linalg.norm(h), e / np.linalg.norm(e)
-    return np.array([perigee, np.cross(normal, perigee), normal])
-
-
-def terminal_error(state, rocket: Rocket = ROCKET) -> np.ndarray:
-    """(h - h_T) / |h_T| and e - e_T in ECI, (..., 6), of states (..., 6 or more: r in m, v in m/s).
-
-    Our measure. Smooth, without a singularity, and zero exactly where all five elements are the target's.
-    """
-    h, e = orbit_vectors(np.moveaxis(np.asarray(state, dtype=np.float64), -1, 0), rocket.mu)
-    h_target, e_target = target_orbit(rocket.target, rocket.mu)
-    return np.concatenate(
-        [(np.stack(h, axis=-1) - h_target) / np.linalg.norm(h_target), np.stack(e, axis=-1) - e_target], axis=-1
-    )
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# Rocket ascent: the five parts of the reward (the paper says what each is for and gives no formula: these are ours)
-# ---------------------------------------------------------------------------------------------------------------------
-
-
-def orbital_reward(distance, next_distance):
-    """R_orbital = 10 (L_t - L_{t+1}), L the sum of |component| of the terminal error in the target orbit's axes.
-
-    The paper speaks of "exponential shaping"; this is linear. Over an episode it adds up to 10 (L_0 - L_T): it is the
-    objective, not a policy-invariant shaping. A sum over components, because a norm hides the small ones behind the
-    largest.
-    """
-    return 10.0 * (distance - next_distance)
-
-
-def trajectory_reward(energy, next_energy, phase, weight):
-    """R_trajectory = w (E_{t+1} - E_t) / (1 MJ/kg) in phases 0 to 2 of 0 to 3, E the specific energy; by default 0."""
-    return weight * (next_energy - energy) / 1e6 * (phase < 3)
-
-
-def guidance_reward(u, up, along, pitch, weight):
-    """R_guidance = -w (1 - u . d), d the direction at the reference pitch above the horizon, along the target's plane.
-
-    u, up, along (3, N); pitch (N,) in rad at the step's start, NaN where there is no guidance: by default everywhere.
-    """
-    cosine = (u * (np.sin(pitch) * up + np.cos(pitch) * along)).sum(axis=0)
-    return np.where(np.isnan(pitch), 0.0, -weight * (1 - cosine))
-
-
-def penalties(altitude, time, turn, burnt, left, mass_weight):
-    """R_penalties = -40 c - 0.024 o - 0.024 s - 0.001 |u_t - u_{t-1}| - w_m (b + c l) / 100 kg.
-
-    c = 1[h < 0], a crash, which must cost more than the worst miss; o = clip((h - 245 km) / 100 km, 0, 1), overshoot;
-    s = clip((110 km - h) / 30 km, 0, 1) after 300 s, a dip into the air at orbital speed; b (kg), the propellant that a
-    step of the last phase burns, l, what a crash leaves of it. Altitude h (m), time (s): the step's end's.
-
-    The paper names h > 0, overshoot beyond 250 km and |u_t - u_{t-1}|; the sizes, the margin that lets o begin at
-    245 km, the dip below 110 km and the price of propellant are ours.
-    """
-    crash = altitude < 0
-    overshoot = np.minimum(np.maximum((altitude - 245e3) / 100e3, 0.0), 1.0)
-    sag = np.minimum(np.maximum((110e3 - altitude) / 30e3, 0.0), 1.0) * (time > 300.0)
-    return -40.0 * crash - 0.024 * (overshoot + sag) - 0.001 * turn - mass_weight * (burnt + crash * left) / 100.0
-
-
-TERMINAL_SCALE = 0.005  # of the reported R_terminal
-
-
-def terminal_reward(error_norm, scale=TERMINAL_SCALE):
-    """R_terminal = -2 ln(1 + d / scale) at the episode's end, d the norm of the terminal error: steep near the target.
-
-    In place of the paper's points (see below). A norm, unlike R_orbital's sum: near the target the largest
-    component is the one to work on, and the noise in the others, which a sum of absolute values charges in full, hardly
-    counts. Errors far below the scale earn almost the same, so a scale that shrinks with the policy's noise is a
-    curriculum of training.
-    """
-    return -2.0 * np.log1p(error_norm / scale)
-
-
-def precision_points(error_norm):
-    """2000 1[d < 0.02] + 1600 e^(-d/0.01) + 1600 e^(-d/0.001), d as in `terminal_reward`: reported only.
-
-    The paper pays 2000 points "for successful orbital insertion" and "precision bonuses up to 3200 points"; what is
-    successful and how the bonuses fall it does not say: 0.02 and the exponentials are ours.
-    """
-    return 2000.0 * (error_norm < 0.02) + 1600.0 * (np.exp(-error_norm / 0.01) + np.exp(-error_norm / 0.001))
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# Rocket ascent: environments
+# Rocket ascent
 # ---------------------------------------------------------------------------------------------------------------------
 
 ACTION_FRAMES = ("eci", "local")
-REFERENCE_PITCH = {  # degrees above the horizon over time (s), until the second boosters are dropped; our own guess
-    "none": None,
-    "linear": ((0.0, 150.4), (90.0, 40.0)),
-    "knots": ((0.0, 10.0, 40.0, 75.2, 150.4), (90.0, 88.0, 72.0, 55.0, 35.0)),
-}
 STIFF = 0.25  # drag's rate |D| / (m |v_rel|) times the step, from which a step is cut
-
-
-def local_frame(y, normal):
-    """Unit vectors up, along-track (normal x up), cross-track (up x along) at states y (7, N): (3, N) each.
-
-    Written out: a matrix product would round a row differently in a larger batch.
-    """
-    up = y[:3] / np.sqrt((y[:3] ** 2).sum(axis=0))
-    (rx, ry, rz), (nx, ny, nz) = up, normal
-    along = np.array([ny * rz - nz * ry, nz * rx - nx * rz, nx * ry - ny * rx])
-    length = np.sqrt((along * along).sum(axis=0))
-    cross = normal[:, None] - (nx * rx + ny * ry + nz * rz) * up
-    return up, along / length, cross / length
 
 
 class RocketVectorEnv(BatchedEnv):
@@ -717,9 +437,9 @@ class RocketVectorEnv(BatchedEnv):
     and so does `end_time`.
 
     Reward: the sum of the five parts R_orbital, R_trajectory, R_guidance, R_penalties and R_terminal, each a function
-    above. `final_info`, (N,) each: `error_norm` (and `error` (N, 6), the terminal error in ECI), `a_km e i_deg raan_deg
-    argp_deg final_mass_kg final_time_s max_altitude_km` (at the steps' ends), the parts' sums, `episodic_return`,
-    `points` (`precision_points`), `crashed`.
+    of `rocket.py`. `final_info`, (N,) each: `error_norm` (and `error` (N, 6), the terminal error in ECI), `a_km e i_deg
+    raan_deg argp_deg final_mass_kg final_time_s max_altitude_km` (at the steps' ends), the parts' sums,
+    `episodic_return`, `points` (`precision_points`), `crashed`.
 
     Attributes that only training changes, to be set before a `reset`: `mass_weight`, `trajectory_weight`,
     `guidance_weight`, `guidance` (a key of `REFERENCE_PITCH`), `end_time` (s, at most the last phase's end) and

@@ -1,5 +1,5 @@
-"""The rocket of envs.py against the paper's equations (typed once more here) with SciPy's integrator, against CSPICE's
-conics, closed forms, and itself: single against batched, ECI against local action frame.
+"""The rocket of rocket.py and envs.py against the paper's equations (typed once more here) with SciPy's integrator,
+against CSPICE's conics, closed forms, and itself: single against batched, ECI against local action frame.
 """
 
 import math
