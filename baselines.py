@@ -128,7 +128,7 @@ def hermite_simpson(problem: Problem, x, u, x_next):
 def program(problem: Problem, defect: Callable, in_circles: bool):
     """The nonlinear program as CasADi symbols: unknowns u_0..u_{T-1}, x_1..x_T, parameter x_0.
 
-    Cost J = sum of dx'Q dx + R u^2 over the steps and Qf |dx|^2 at each phase's end (the paper's "J", by phases).
+    Cost J = sum of dx'Q dx + R u^2 over the steps and Qf |dx|^2 at each phase's end (the paper's "J", summed by us).
     Constraints: the defects (2T of them, = 0); with `in_circles` also |dx|^2 / r^2 (<= 1) at each phase's end.
     """
     import casadi as ca
@@ -307,7 +307,7 @@ ASCENTS = {
         Ascent("free"),
         Ascent("free_table_isp", replace(ROCKET, table_isp=True)),
         Ascent("fixed", free=False),
-        Ascent("fixed_capped", free=False, ceiling=250e3),
+        Ascent("fixed_capped", free=False, ceiling=250e3),  # the paper penalises an overshoot; the bound is ours
         Ascent("drag_free", replace(ROCKET, Cd=0.0), floor=5.0),  # else its optimum, held over steps, skims the ground
     )
 }

@@ -197,7 +197,7 @@ def ratio_lines(metrics: dict) -> list[str]:
         return [f"  No cost ratio: {reason} (missing a circle is cheaper, not better)."]
     over = "the starts that hit every circle" if waypoints else f"all {metrics['eval_starts']} starts"
     lines = [f"  Cost ratio ours / optimum over {over}:"]
-    lines.append(f"    mean {metrics['ratio_mean']:.4f}: what the paper's statistic, a mean of ten starts, is on average")
+    lines.append(f"    mean {metrics['ratio_mean']:.4f}: the paper's statistic, a mean of ten starts, on average")
     draws = {key: metrics.get(f"ten_start_ratio_mean_{key}") for key in ("p05", "p50", "p95")}
     if None not in draws.values():  # fewer than ten starts, or an older eval.json
         interval = f"{draws['p05']:.4f} to {draws['p95']:.4f} (5 % to 95 %), median {draws['p50']:.4f}"

@@ -1,10 +1,10 @@
 """PPO with a Gated Transformer-XL on the double integrator, measured against the true optimum in the same run.
 
-    python ppo_gtrxl_di.py --seed 1                                            # Table 1 of the paper
+    python ppo_gtrxl_di.py --seed 1    # Table 1 of the paper, ours where it is silent
     python ppo_gtrxl_di.py --seed 1 --env-id DoubleIntegratorWaypoints-v0      # two waypoints, one policy
     python ppo_gtrxl_di.py --eval-only --checkpoint results/di/agent.safetensors
 
-Top to bottom: arguments (Table 1), problem, Gated Transformer-XL, agent, PPO, checkpoints, main. From the first
+Top to bottom: arguments (Table 1's first), problem, Gated Transformer-XL, agent, PPO, training, main. From the first
 "Shared" on, all ppo_gtrxl_*.py are the same to the letter. T steps, N environments, L memory, d width, H heads.
 """
 
@@ -51,7 +51,7 @@ class Args:
     # environment
     env_id: str = "DoubleIntegrator-v0"  # the id of the environment, one of ENV_IDS
     observe_phase: bool = True  # show time and phase to the policy
-    radius_curriculum: float = 12.0  # waypoints: training radius at first, in target radii (1: the paper)
+    radius_curriculum: float = 12.0  # waypoints: training radius at first, in target radii (1: none, as in the paper)
     reward_scale: float = 0.1  # factor on the rewards in training; everything logged is unscaled
 
     # transformer (Table 1)
@@ -61,11 +61,11 @@ class Args:
     memory_length: int = 32  # memory length L: a step attends to itself and the L steps before it
     mlp_dim: int = 128  # width of the position-wise MLP
     hidden_dim: int = 128  # width of the hidden layer of each head
-    memory_noise: float = 0.1  # spread of the memory before an episode's start in training (Algorithm 1, line 5)
+    memory_noise: float = 0.1  # spread of the memory before an episode's start (Algorithm 1, line 5; the value is ours)
 
-    # PPO (Table 1)
+    # PPO (Table 1 where it has a row; README has the rest)
     total_updates: int = 1000  # number of updates
-    num_envs: int = 80  # number of parallel environments, each flying one episode per update
+    num_envs: int = 80  # parallel environments, one episode each per update (256 steps of 16 workers, a guess)
     learning_rate: float = 3e-4  # learning rate of the first update
     learning_rate_final: float = 3e-5  # that of the last update (linear in between); with kl the lowest
     gamma: float = 0.99  # the discount factor gamma
@@ -238,7 +238,7 @@ LOG_STD_RANGE = (-8.0, 0.5)
 
 
 class Agent(nn.Module):
-    """Actor and critic on one GTrXL trunk. The policy is Gaussian with a state-independent log-std."""
+    """Actor and critic on one GTrXL trunk. The Gaussian policy has one log-std for all states, learned or set."""
 
     def __init__(self, args, envs):
         super().__init__()

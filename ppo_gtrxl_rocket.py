@@ -4,7 +4,7 @@
     python ppo_gtrxl_rocket.py --seed 1 --env-id RocketAscentCutoff-v0         # free final time, most mass
     python ppo_gtrxl_rocket.py --eval-only --checkpoint results/rocket_fixed/agent.safetensors
 
-Top to bottom: arguments, problem, Gated Transformer-XL, agent, PPO, checkpoints, main. From the first
+Top to bottom: arguments, problem, Gated Transformer-XL, agent, PPO, training, main. From the first
 "Shared" on, all ppo_gtrxl_*.py are the same to the letter. T steps, N environments, L memory, d width, H heads.
 """
 
@@ -53,7 +53,7 @@ class Args:
     env_id: str = "RocketAscent-v0"  # the id of the environment, one of ENV_IDS
     observe_phase: bool = True  # show time and phase to the policy
     action_frame: str = "local"  # the thrust direction's axes: local (up, along-track, cross-track) or eci
-    guidance: str = "none"  # early reference pitch of R_guidance: none, linear or knots
+    guidance: str = "none"  # early reference pitch of R_guidance: none (R_guidance is 0), linear or knots
     mass_weight: float = 1.0  # cut-off: reward lost for 100 kg burnt in the last phase, from 60 % of the updates on
     reward_scale: float = 0.2  # factor on the rewards in training; everything logged is unscaled
 
@@ -64,7 +64,7 @@ class Args:
     memory_length: int = 32  # memory length L: a step attends to itself and the L steps before it
     mlp_dim: int = 64  # width of the position-wise MLP
     hidden_dim: int = 64  # width of the hidden layer of each head
-    memory_noise: float = 0.1  # spread of the memory before an episode's start in training (Algorithm 1, line 5)
+    memory_noise: float = 0.1  # spread of the memory before an episode's start (Algorithm 1, line 5; the value is ours)
 
     # PPO
     total_updates: int = 500  # number of updates
@@ -137,10 +137,10 @@ def mean_action(output, action_scale):
 
 
 def set_curriculum(envs, args, progress, std):
-    """What only training changes. All flights start alike, and are compared in groups of any size.
+    """What only training changes, all of it ours. The flights start alike: groups of any size may be compared.
 
-    Noise moves a flight's end by about std / 10: R_terminal is as steep as that tells apart. Burning costs nothing in
-    the first quarter of the updates, all of --mass-weight from 60 % on: precision comes first.
+    Noise moves a flight's end by about std / 10: R_terminal is as steep as what can be told apart. Burning costs
+    nothing in the first quarter of the updates, all of --mass-weight from 60 % on: precision comes first.
     """
     envs.flights_per_start = args.flights_per_start
     envs.guidance = args.guidance
@@ -271,7 +271,7 @@ LOG_STD_RANGE = (-8.0, 0.5)
 
 
 class Agent(nn.Module):
-    """Actor and critic on one GTrXL trunk. The policy is Gaussian with a state-independent log-std."""
+    """Actor and critic on one GTrXL trunk. The Gaussian policy has one log-std for all states, learned or set."""
 
     def __init__(self, args, envs):
         super().__init__()

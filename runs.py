@@ -72,7 +72,7 @@ def read_flags(kind, argv):
     """
     with contextlib.redirect_stderr(io.StringIO()) as frame:
         try:
-            args = tyro.cli(kind, args=argv)
+            args = tyro.cli(kind, args=argv, description=allowed(kind))
         except SystemExit as stop:
             if not stop.code:  # --help
                 raise
@@ -81,6 +81,13 @@ def read_flags(kind, argv):
             fail(f"{first} (--help lists what is allowed)")
     words = [word.split("=")[0] for word in argv if word.startswith("--")]
     return args, {word.removeprefix("--").replace("-", "_").removeprefix("no_") for word in words}
+
+
+def allowed(kind):
+    """What --help says of the numbers: each flag of `kind` with its range."""
+    ranges = {name: bounds for name, bounds in RANGES.items() if hasattr(kind, name)}
+    flags = (f"--{name.replace('_', '-')} {low:g} to {high:g}" for name, (low, high) in ranges.items())
+    return f"Ranges: {', '.join(flags)}"
 
 
 def parse_args(kind, argv, env_options, buffers):
