@@ -67,10 +67,10 @@ class Args:
     memory_noise: float = 0.1  # spread of the memory before an episode's start (Algorithm 1, line 5; the value is ours)
 
     # PPO
-    total_updates: int = 500  # number of updates
+    total_updates: int = 600  # number of updates
     num_envs: int = 32  # number of parallel environments, each flying one episode per update
-    learning_rate: float = 3e-4  # learning rate of the first update
-    learning_rate_final: float = 1e-5  # that of the last update (linear in between); with kl the lowest
+    learning_rate: float = 2e-3  # learning rate of the first update; with noise for a standard deviation of 1
+    learning_rate_final: float = 1e-5  # learning rate of the last update (linear in between)
     gamma: float = 1.0  # the discount factor gamma
     gae_lambda: float = 0.985  # the lambda for the general advantage estimation
     gae_lambda_final: float | None = 1.0  # the same in the last update (linear in between; none: --gae-lambda)
@@ -83,12 +83,13 @@ class Args:
     vf_coef: float = 0.5  # coefficient of the value function
     max_grad_norm: float = 0.5  # the maximum norm for the gradient clipping
     target_kl: float | None = 0.02  # the KL divergence from which an update takes no further step (none: no limit)
-    lr_schedule: str = "kl"  # linear, or kl: the learning rate follows half of --target-kl between its two ends
+    lr_schedule: str = "noise"  # linear, or noise: --learning-rate times the policy's standard deviation
     noise: str = "gated"  # who sets the log-std: learned, schedule (linear), gated (linear, waits for the episodes)
     log_std: float = -1.9  # initial log of the policy's standard deviation, in the action's unit, -8 to 0.5
-    log_std_final: float = -4.6  # the last update's with schedule and gated
+    log_std_final: float = -6.2  # the last update's, with schedule, gated and in the refinement
     flights_per_start: int = 32  # flights of each start, compared with one another (1: the paper)
-    refine_from: float = 0.0  # part of the updates after which the noise falls
+    refine_from: float | None = None  # part of the updates after which the refinement begins (none: never)
+    log_std_refine: float | None = None  # log-std at the refinement's beginning, from where it falls (none: as it is)
     weight_average: float = 0.99  # decay of the averaged weights used in evaluation (0: off)
 
 
@@ -136,7 +137,7 @@ def mean_action(output, action_scale):
     return F.normalize(output, dim=-1)
 
 
-def set_curriculum(envs, args, progress, std):
+def set_curriculum(envs, args, progress, refines, std):
     """What only training changes, all of it ours. The flights start alike: groups of any size may be compared.
 
     Noise moves a flight's end by about std / 10: R_terminal is as steep as what can be told apart. Burning costs
@@ -473,21 +474,36 @@ def linear_schedule(first, last, progress):
     return first + (last - first) * progress
 
 
+def begin_refinement(agent, args):
+    """Small noise that is set, not learned, from here on; the critic, whose targets become others, starts from zero."""
+    if args.log_std_refine is not None:
+        nn.init.constant_(agent.actor_logstd, args.log_std_refine)
+    for parameter in agent.critic[-1].parameters():
+        nn.init.zeros_(parameter)
+
+
 def train(args, agent, average, optimizer, envs, run):
     """Algorithm 1, its lines beside ours. `run` counts, logs, saves and evaluates; it changes nothing that is learned.
 
     Raises FloatingPointError, before the optimiser moves the weights, when a loss or the gradient is not finite.
     """
+    last = max(args.total_updates - 1, 1)
     target_kl = math.inf if args.target_kl is None else args.target_kl
+    refine_at = math.inf if args.refine_from is None else 1 + math.ceil(args.refine_from * last)
     for iteration in range(run.progress["total_updates"] + 1, args.total_updates + 1):  # line 2
-        progress = (iteration - 1) / max(args.total_updates - 1, 1)
+        progress = (iteration - 1) / last
+        refines = iteration >= refine_at
+        if iteration == refine_at:
+            begin_refinement(agent, args)
+        agent.actor_logstd.requires_grad_(args.noise == "learned" and not refines)
+        std = agent.actor_logstd.exp().mean().item()
+        learning_rate = args.learning_rate * std
+        if args.lr_schedule == "linear":
+            learning_rate = linear_schedule(args.learning_rate, args.learning_rate_final, progress)
+        optimizer.param_groups[0]["lr"] = learning_rate
         ent_coef = linear_schedule(args.ent_coef, args.ent_coef_final, progress)
         gae_lambda = linear_schedule(args.gae_lambda, args.gae_lambda_final, progress)
-        if args.lr_schedule == "linear":
-            optimizer.param_groups[0]["lr"] = linear_schedule(args.learning_rate, args.learning_rate_final, progress)
-        learning_rate = optimizer.param_groups[0]["lr"]
-        std = agent.actor_logstd.exp().mean().item()
-        set_curriculum(envs, args, progress, std)
+        set_curriculum(envs, args, progress, refines, std)
 
         # lines 3-13: fly one episode in every environment
         batch, episodes = rollout(agent, envs, args.reward_scale, args.memory_noise)
@@ -523,15 +539,13 @@ def train(args, agent, average, optimizer, envs, run):
         losses["explained_variance"] = explained_variance(batch.values, batch.returns, batch.alive)
         losses["baseline_explained_variance"] = explained_variance(baseline, returns, batch.alive)
 
-        # the learning rate and the noise of the next update
-        if args.lr_schedule == "kl" and losses["approx_kl"] > 0.75 * target_kl:
-            optimizer.param_groups[0]["lr"] = max(learning_rate / 1.3, args.learning_rate_final)
-        if args.lr_schedule == "kl" and losses["approx_kl"] < target_kl / 3:
-            optimizer.param_groups[0]["lr"] = min(learning_rate * 1.2, args.learning_rate)
-        falls = args.noise == "schedule" or args.noise == "gated" and precise_enough(episodes, std)
-        if falls and progress >= args.refine_from:
+        # the noise of the next update: linear to its last value, from wherever it is
+        falls = args.noise == "schedule" or refines
+        if args.noise == "gated":
+            falls = precise_enough(episodes, std)
+        if falls:
             updates_left = max(args.total_updates - iteration, 1)
-            agent.actor_logstd += (args.log_std_final - agent.actor_logstd) / updates_left
+            agent.actor_logstd.data += (args.log_std_final - agent.actor_logstd.data) / updates_left
         run.end_update(iteration, batch.alive, episodes, losses, learning_rate)
 
 

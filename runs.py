@@ -44,12 +44,12 @@ RANGES = {  # lowest and highest value of every numeric flag; NaN and infinity a
     **dict.fromkeys(["gamma", "gae_lambda", "gae_lambda_final", "memory_noise", "refine_from"], (0.0, 1.0)),
     **dict.fromkeys(["ent_coef", "ent_coef_final", "vf_coef", "mass_weight"], (0.0, 1e3)),
     **dict.fromkeys(["reward_scale", "max_grad_norm", "target_kl"], (1e-9, 1e9)),
-    **dict.fromkeys(["log_std", "log_std_final"], (-8.0, 0.5)),
+    **dict.fromkeys(["log_std", "log_std_refine", "log_std_final"], (-8.0, 0.5)),
     **{"eval_starts": (10, 10**6), "num_blocks": (1, 64), "memory_length": (0, 8192)},
     **{"flights_per_start": (1, 10**6)},
 }
 CHOICES = {"action_frame": ("local", "eci"), "guidance": ("none", "linear", "knots")}
-CHOICES |= {"noise": ("learned", "schedule", "gated"), "lr_schedule": ("linear", "kl")}
+CHOICES |= {"noise": ("learned", "schedule", "gated"), "lr_schedule": ("linear", "noise")}
 NETWORK = ("num_blocks", "embed_dim", "num_heads", "memory_length", "mlp_dim", "hidden_dim")
 MAY_CHANGE_ON_RESUME = {"resume", "cuda", "num_threads"}
 
@@ -109,7 +109,7 @@ def parse_args(kind, argv, env_options, buffers):
     elif args.eval_only:
         refuse("checkpoint", None, "must name the agent.safetensors that --eval-only flies")
     check(args, typed, env_ids)
-    for name in ("gae_lambda", "ent_coef"):  # a last value that is not given is the first
+    for name in ("gae_lambda",):  # a last value that is not given is the first
         if getattr(args, f"{name}_final") is None:
             setattr(args, f"{name}_final", getattr(args, name))
     if args.eval_starts is None:
@@ -147,8 +147,6 @@ def check(args, typed, env_ids):
             refuse(name, value, f"must be between {RANGES[name][0]} and {RANGES[name][1]}")
         if name in choices and value not in choices[name]:
             refuse(name, value, f"must be one of {', '.join(choices[name])}")
-    if args.lr_schedule == "kl" and args.target_kl is None:
-        refuse("lr_schedule", args.lr_schedule, "needs --target-kl")
     if args.embed_dim % args.num_heads:
         refuse("num_heads", args.num_heads, f"must divide --embed-dim {args.embed_dim}")
     for name in ("eval_json", "eval_npz"):
