@@ -167,16 +167,21 @@ def check_share(args, typed):
     if args.num_envs < processes:
         refuse("num_envs", args.num_envs, f"must be at least the number of processes, {processes}")
     share = args.num_envs // processes
+    shares = {share, -(-args.num_envs // processes)}  # the first processes fly one more where it does not divide
     whose = f"--num-envs {args.num_envs}" + (f" / {processes} processes" if processes > 1 else "")
-    for name in ("num_minibatches", "flights_per_start"):
-        value = getattr(args, name)
-        if value > share and name in typed:
-            refuse(name, value, f"must be at most {whose}")
-        if value > share:
-            print(f"--{name.replace('_', '-')} lowered from {value} to {whose}")
-            setattr(args, name, share)
-    if args.num_envs % (processes * args.flights_per_start):
-        refuse("flights_per_start", args.flights_per_start, f"must divide {whose}")
+    minibatches, group = args.num_minibatches, args.flights_per_start
+    if minibatches > share:
+        if "num_minibatches" in typed:
+            refuse("num_minibatches", minibatches, f"must be at most {whose}")
+        print(f"--num-minibatches lowered from {minibatches} to {whose}")
+        args.num_minibatches = share
+    if any(flights % group for flights in shares):
+        if "flights_per_start" in typed:
+            refuse("flights_per_start", group, f"must divide {whose}")
+        while any(flights % group for flights in shares):
+            group -= 1
+        print(f"--flights-per-start lowered from {args.flights_per_start} to {group}, which divides {whose}")
+        args.flights_per_start = group
 
 
 # ---------------------------------------------------------------------------------------------------------------------
