@@ -1,10 +1,10 @@
 """PPO with a Gated Transformer-XL on the double integrator, measured against the true optimum in the same run.
 
-    python ppo_gtrxl_di.py --seed 1    # Table 1 of the paper, ours where it is silent
+    python ppo_gtrxl_di.py --seed 1                             # Table 1, ours where it is silent
     python ppo_gtrxl_di.py --seed 1 --env-id DoubleIntegratorWaypoints-v0      # two waypoints, one policy
     python ppo_gtrxl_di.py --eval-only --checkpoint results/di/agent.safetensors
 
-Top to bottom: arguments (Table 1's first), problem, Gated Transformer-XL, agent, PPO, training, main. From the first
+Top to bottom: arguments, problem, Gated Transformer-XL, agent, PPO, training, main. From the first
 "Shared" on, all ppo_gtrxl_*.py are the same to the letter. T steps, N environments, L memory, d width, H heads.
 """
 
@@ -66,8 +66,8 @@ class Args:
     # PPO (Table 1 where it has a row; README has the rest)
     total_updates: int = 1000  # number of updates
     num_envs: int = 80  # parallel environments, one episode each per update (256 steps of 16 workers, a guess)
-    learning_rate: float = 3e-4  # learning rate of the first update; with noise for a standard deviation of 1
-    learning_rate_final: float = 3e-5  # learning rate of the last update (linear in between)
+    learning_rate: float = 3e-4  # learning rate of the first update; with --lr-schedule std where the deviation is 1
+    learning_rate_final: float = 3e-5  # learning rate of the last update (linear in between; unused with std)
     gamma: float = 0.99  # the discount factor gamma
     gae_lambda: float = 0.95  # the lambda for the general advantage estimation
     gae_lambda_final: float | None = None  # the same in the last update (linear in between; none: --gae-lambda)
@@ -80,25 +80,26 @@ class Args:
     vf_coef: float = 0.2  # coefficient of the value function
     max_grad_norm: float = 0.5  # the maximum norm for the gradient clipping
     target_kl: float | None = None  # the KL divergence from which an update takes no further step (none: no limit)
-    lr_schedule: str = "linear"  # linear, or noise: --learning-rate times the policy's standard deviation
+    lr_schedule: str = "linear"  # linear, or std: --learning-rate times the policy's standard deviation
     noise: str = "learned"  # who sets the log-std: learned, schedule (linear), gated (linear, waits for the episodes)
     log_std: float = 0.0  # initial log of the policy's standard deviation, in the action's unit, -8 to 0.5
-    log_std_final: float = -4.0  # the last update's, with schedule, gated and in the refinement
+    log_std_final: float = -4.0  # log-std of the last update, where it is not learned to the end
     flights_per_start: int = 1  # flights of each start in the refinement, compared with one another (1: the paper)
     refine_from: float | None = None  # part of the updates after which the refinement begins (none: never)
-    log_std_refine: float | None = None  # log-std at the refinement's beginning, from where it falls (none: as it is)
+    log_std_refine: float | None = None  # log-std at the refinement's beginning (none: as it is)
     weight_average: float = 0.998  # decay of the averaged weights used in evaluation (0: off)
 
 
 # Problem: what differs from the other scripts -------------------------------------------------------------------------
 ENV_IDS = ("DoubleIntegrator-v0", "DoubleIntegratorWaypoints-v0")
 ENV_OPTIONS = ("observe_phase",)  # arguments of the environments
-BUFFERS = {env_id: {"observation_scale": [1.0] * n} for env_id, n in zip(ENV_IDS, (3, 6))}  # all is of order one
-INITIAL_ACTION = [0.0]
+SIZES = dict(zip(ENV_IDS, (3, 6)))  # of an observation
+BUFFERS = {env_id: {"observation_scale": [1.0] * n} for env_id, n in SIZES.items()}  # `features` reads agent.<name>
+INITIAL_ACTION = [0.0]  # the mean before training
 
 
 def features(agent, obs):
-    """What the encoder sees of observations (..., obs); the agent holds `BUFFERS`, as its checkpoint does."""
+    """What the encoder sees of observations (..., obs)."""
     return obs / agent.observation_scale
 
 
@@ -108,19 +109,21 @@ def mean_action(output, action_scale):
 
 
 def set_curriculum(envs, args, progress, refines, std):
-    """What only training changes: many starts first; in the refinement each start several times, to be compared.
+    """What only training changes, all of it ours; returns how many flights in a row have the same start.
 
-    The waypoints' radius is K r at first and shrinks geometrically to r until the refinement, or 60 % of the updates.
+    Many starts at first, in the refinement each one several times. The waypoints' radius is --radius-curriculum times
+    the true one at first and shrinks geometrically to it until the refinement, or 60 % of the updates.
     """
     envs.flights_per_start = args.flights_per_start if refines else 1
     shrinks_until = 0.6 if args.refine_from is None else args.refine_from
+    left = max(0.0, 1 - progress / shrinks_until) if shrinks_until else 0.0
     if len(envs.problem.phases) > 1:
-        left = 0.0 if progress >= shrinks_until else 1 - progress / shrinks_until
         envs.radius_scale = args.radius_curriculum**left
+    return envs.flights_per_start
 
 
 def precise_enough(episodes, std):
-    """--noise gated: lower the noise once most of the sampled episodes hit every circle."""
+    """--noise gated: the noise falls once most of the sampled episodes hit every circle."""
     return episodes["hit"].all(axis=1).mean() >= 0.85
 
 
@@ -320,7 +323,7 @@ class Batch:
     rewards: torch.Tensor  # (T, N), scaled
     values: torch.Tensor  # (T, N), the critic's output
     alive: torch.Tensor  # (T, N)
-    memory: torch.Tensor  # (blocks, N, L, d)
+    memory: torch.Tensor  # (blocks, N, L, d), m_0; what follows, encode makes anew from obs, with gradients
     advantages: torch.Tensor | None = None  # (T, N), filled by train, as the returns
     returns: torch.Tensor | None = None  # (T, N), what the critic learns
 
@@ -336,7 +339,7 @@ def rollout(agent, envs, reward_scale, memory_noise):
     batch.obs[:] = torch.as_tensor(next_obs)  # steps that nobody lives to are computed, too: they need a real state
     for t in range(T):  # line 6
         batch.obs[t], batch.alive[t] = torch.as_tensor(next_obs), torch.as_tensor(alive)
-        hidden[t] = agent.encode_step(batch.obs[t], cache, t)  # lines 7 and 10
+        hidden[t] = agent.encode_step(batch.obs[t], cache, t)  # lines 7 and 10: of states, not of actions
         batch.actions[t] = agent.get_policy(hidden[t]).sample()  # line 8
         next_obs, reward, terminated, _, info = envs.step(batch.actions[t].cpu().numpy())  # line 9
         batch.rewards[t] = torch.as_tensor(reward * alive * reward_scale)
@@ -346,7 +349,7 @@ def rollout(agent, envs, reward_scale, memory_noise):
         alive = alive & ~terminated  # an ended environment has started anew; only its first episode counts
         if not alive.any():
             break
-    batch.logprobs, _, batch.values = agent.evaluate_actions(hidden, batch.actions)
+    batch.logprobs, _, batch.values = agent.evaluate_actions(hidden, batch.actions)  # v_t of line 8
     everyone = runs.gathered(episodes)
     return batch, {key: np.concatenate([part[key] for part in everyone]) for key in episodes}
 
@@ -372,7 +375,12 @@ def moments(x, alive, dim):
 
 
 def linear_fit(x, y, alive):
-    """Ridge regression of y (..., G) on x (..., G, k) over the G episodes of a group that live: the fitted y."""
+    """Ridge regression of y (..., G) on x (..., G, k) over the G episodes of a group that live: the fitted y.
+
+    Each episode is in its own fit. Its residual is 1 - l times that of a fit without it, with the leverage l a function
+    of the states at this step alone, not of the action: a state's gradient keeps its direction, extreme states count
+    less. (A fit without it was worse: README.)
+    """
     weight, count = alive.double()[..., None], alive.double().sum(-1)[..., None, None].clamp(min=1)
     x, y = x.double(), y.double()[..., None]
     y_mean = (y * weight).sum(-2, keepdim=True) / count
@@ -384,16 +392,11 @@ def linear_fit(x, y, alive):
 
 
 def returns_baseline(batch, gamma, group):
-    """What of the returns the critic need not learn: V(s, t) = baseline + scale critic(s, t); (T, N) and (T, 1).
+    """b (T, N) and c (T, 1) of V(s, t) = b + c critic(s, t). Ours; with group 1, b = 0 and c = 1, it is the paper.
 
-    Each `group` of episodes that follow one another in the batch began alike. What their returns from step t on have in
-    common, and what is linear in the states that they have reached by then, is the baseline: near one path that is most
-    of it, and a critic's error would drown what small noise changes. Without groups (1) the critic learns the returns
-    themselves, as in the paper.
-
-    The fit holds the episode that it is the baseline of: its residual is (1 - h) times the leave-one-out one. h depends
-    on the states at that step alone, not on the action: each state's gradient keeps its direction, extreme states count
-    less.
+    Each `group` of episodes that follow one another flew the same start. b regresses their returns from step t on
+    linearly on the states that they have reached by then, c is the spread of what is left. With small noise a critic's
+    error is larger than what an action changes; flights of one start, compared with one another, show it.
     """
     if group == 1:
         return torch.zeros_like(batch.rewards), torch.ones_like(batch.rewards[:, :1])
@@ -415,14 +418,15 @@ def explained_variance(prediction, returns, alive):
 def ppo_loss(agent, batch, mb, clip_coef, vf_coef, ent_coef):
     """-L_CLIP + c1 L_VF - c2 H over the living steps of the episodes `mb`; returns it and what is logged.
 
-    The minibatch is that of all processes: the loss is this one's share of its mean, what is logged is the sum.
+    The paper's sum with the sign that raises L_CLIP, and L_VF = 1/2 (V - R)^2. Under torchrun the loss is this
+    process's part of the mean (the gradients are then summed), what is logged is of all.
     """
     alive, advantages = batch.alive[:, mb], batch.advantages[:, mb]
     steps = total(alive.sum())
     mean = lambda x: (x * alive).sum() / steps  # noqa: E731
     hidden = agent.encode(batch.obs[:, mb].transpose(0, 1), batch.memory[:, mb]).transpose(0, 1)  # line 17
     newlogprob, entropy, newvalue = agent.evaluate_actions(hidden, batch.actions[:, mb])
-    logratio = newlogprob - batch.logprobs[:, mb]
+    logratio = (newlogprob - batch.logprobs[:, mb]) * alive  # beyond an episode's end it could overflow
     ratio = logratio.exp()
     clipped = torch.clamp(ratio, 1 - clip_coef, 1 + clip_coef)
     pg_loss = mean(torch.max(-advantages * ratio, -advantages * clipped))
@@ -443,7 +447,7 @@ def linear_schedule(first, last, progress):
 
 
 def begin_refinement(agent, args):
-    """Small noise that is set, not learned, from here on; the critic, whose targets become others, starts from zero."""
+    """From here on the noise is set, not learned; where starts are now flown in groups, V starts as their baseline."""
     if args.log_std_refine is not None:
         nn.init.constant_(agent.actor_logstd, args.log_std_refine)
     for parameter in agent.critic[-1].parameters():
@@ -458,26 +462,26 @@ def train(args, agent, average, optimizer, envs, run):
     last = max(args.total_updates - 1, 1)
     target_kl = math.inf if args.target_kl is None else args.target_kl
     refine_at = math.inf if args.refine_from is None else 1 + math.ceil(args.refine_from * last)
-    for iteration in range(run.progress["total_updates"] + 1, args.total_updates + 1):  # line 2
+    for iteration in range(run.updates_done + 1, args.total_updates + 1):  # line 2
         progress = (iteration - 1) / last
         refines = iteration >= refine_at
         if iteration == refine_at:
             begin_refinement(agent, args)
         agent.actor_logstd.requires_grad_(args.noise == "learned" and not refines)
         std = agent.actor_logstd.exp().mean().item()
-        learning_rate = args.learning_rate * std
-        if args.lr_schedule == "linear":
-            learning_rate = linear_schedule(args.learning_rate, args.learning_rate_final, progress)
+        learning_rate = linear_schedule(args.learning_rate, args.learning_rate_final, progress)
+        if args.lr_schedule == "std":
+            learning_rate = args.learning_rate * std
         optimizer.param_groups[0]["lr"] = learning_rate
         ent_coef = linear_schedule(args.ent_coef, args.ent_coef_final, progress)
         gae_lambda = linear_schedule(args.gae_lambda, args.gae_lambda_final, progress)
-        set_curriculum(envs, args, progress, refines, std)
+        group = set_curriculum(envs, args, progress, refines, std)
 
         # lines 3-13: fly one episode in every environment
         batch, episodes = rollout(agent, envs, args.reward_scale, args.memory_noise)
 
         # line 14: advantages, and what the critic learns
-        baseline, scale = returns_baseline(batch, args.gamma, envs.flights_per_start)
+        baseline, scale = returns_baseline(batch, args.gamma, group)
         values = baseline + scale * batch.values
         advantages, returns = gae(batch.rewards, values, batch.alive, args.gamma, gae_lambda)
         batch.returns = (returns - baseline) / scale
@@ -503,18 +507,16 @@ def train(args, agent, average, optimizer, envs, run):
                 average.update_parameters(agent)
             if losses["approx_kl"] > target_kl:
                 break  # the minibatch that went too far has taken no step, and ends the update
-        losses = {name: torch.stack([logged[name] for logged in log]).mean().item() for name in losses}
-        losses["explained_variance"] = explained_variance(batch.values, batch.returns, batch.alive)
-        losses["baseline_explained_variance"] = explained_variance(baseline, returns, batch.alive)
+        means = {name: torch.stack([logged[name] for logged in log]).mean().item() for name in losses}
+        means["explained_variance"] = explained_variance(batch.values, batch.returns, batch.alive)
+        means["baseline_explained_variance"] = explained_variance(baseline, returns, batch.alive)
 
         # the noise of the next update: linear to its last value, from wherever it is
-        falls = args.noise == "schedule" or refines
-        if args.noise == "gated":
-            falls = precise_enough(episodes, std)
-        if falls:
+        falls = {"learned": refines, "schedule": True, "gated": precise_enough(episodes, std)}
+        if falls[args.noise]:
             updates_left = max(args.total_updates - iteration, 1)
             agent.actor_logstd.data += (args.log_std_final - agent.actor_logstd.data) / updates_left
-        run.end_update(iteration, batch.alive, episodes, losses, learning_rate)
+        run.end_update(iteration, batch.alive, episodes, means, learning_rate)
 
 
 def main(argv):

@@ -1,6 +1,6 @@
 """PPO with a Gated Transformer-XL on a four-phase rocket ascent, measured against the true optimum in the same run.
 
-    python ppo_gtrxl_rocket.py --seed 1                                        # fixed 961 s, the paper's problem
+    python ppo_gtrxl_rocket.py --seed 1                                        # fixed 961 s, as in the paper
     python ppo_gtrxl_rocket.py --seed 1 --env-id RocketAscentCutoff-v0         # free final time, most mass
     python ppo_gtrxl_rocket.py --eval-only --checkpoint results/rocket_fixed/agent.safetensors
 
@@ -43,7 +43,7 @@ class Args:
     checkpoint: str | None = None  # start from these weights (.safetensors)
     resume: str | None = None  # run folder of an interrupted run to go on with, bit for bit
     eval_only: bool = False  # fly the mean action of --checkpoint, train nothing, write only --eval-json and --eval-npz
-    eval_starts: int | None = None  # number of evaluation starts (default: 1000 with --eval-only, 50 at a run's end)
+    eval_starts: int | None = None  # number of evaluation starts (a rocket has one)
     eval_seed: int = 0  # seed of the evaluation starts
     eval_json: str | None = None  # where --eval-only writes the metrics
     eval_npz: str | None = None  # where --eval-only writes the trajectories
@@ -57,7 +57,7 @@ class Args:
     mass_weight: float = 1.0  # cut-off: reward lost for 100 kg burnt in the last phase, from 60 % of the updates on
     reward_scale: float = 0.2  # factor on the rewards in training; everything logged is unscaled
 
-    # transformer (a laptop's; README has Table 1's)
+    # transformer (a laptop's; README has Table 1's beside ours)
     num_blocks: int = 2  # number of GTrXL blocks
     embed_dim: int = 64  # embedding dimension d
     num_heads: int = 4  # number of attention heads
@@ -66,11 +66,11 @@ class Args:
     hidden_dim: int = 64  # width of the hidden layer of each head
     memory_noise: float = 0.1  # spread of the memory before an episode's start (Algorithm 1, line 5; the value is ours)
 
-    # PPO
+    # PPO (README has Table 1's beside ours)
     total_updates: int = 600  # number of updates
-    num_envs: int = 32  # number of parallel environments, each flying one episode per update
-    learning_rate: float = 2e-3  # learning rate of the first update; with noise for a standard deviation of 1
-    learning_rate_final: float = 1e-5  # learning rate of the last update (linear in between)
+    num_envs: int = 32  # parallel environments, one episode each per update
+    learning_rate: float = 2e-3  # learning rate of the first update; with --lr-schedule std where the deviation is 1
+    learning_rate_final: float = 1e-5  # learning rate of the last update (linear in between; unused with std)
     gamma: float = 1.0  # the discount factor gamma
     gae_lambda: float = 0.985  # the lambda for the general advantage estimation
     gae_lambda_final: float | None = 1.0  # the same in the last update (linear in between; none: --gae-lambda)
@@ -83,39 +83,40 @@ class Args:
     vf_coef: float = 0.5  # coefficient of the value function
     max_grad_norm: float = 0.5  # the maximum norm for the gradient clipping
     target_kl: float | None = 0.02  # the KL divergence from which an update takes no further step (none: no limit)
-    lr_schedule: str = "noise"  # linear, or noise: --learning-rate times the policy's standard deviation
+    lr_schedule: str = "std"  # linear, or std: --learning-rate times the policy's standard deviation
     noise: str = "gated"  # who sets the log-std: learned, schedule (linear), gated (linear, waits for the episodes)
     log_std: float = -1.9  # initial log of the policy's standard deviation, in the action's unit, -8 to 0.5
-    log_std_final: float = -6.2  # the last update's, with schedule, gated and in the refinement
+    log_std_final: float = -6.2  # log-std of the last update, where it is not learned to the end
     flights_per_start: int = 32  # flights of each start, compared with one another (1: the paper)
     refine_from: float | None = None  # part of the updates after which the refinement begins (none: never)
-    log_std_refine: float | None = None  # log-std at the refinement's beginning, from where it falls (none: as it is)
+    log_std_refine: float | None = None  # log-std at the refinement's beginning (none: as it is)
     weight_average: float = 0.99  # decay of the averaged weights used in evaluation (0: off)
 
 
 # Problem: what differs from the other scripts -------------------------------------------------------------------------
 ENV_IDS = ("RocketAscent-v0", "RocketAscentCutoff-v0")
 ENV_OPTIONS = ("observe_phase", "action_frame")  # arguments of the environments
-AXES, (H, E) = target_axes(), target_orbit()  # perigee, semi-latus, normal; angular momentum and eccentricity vector
+AXES = target_axes()  # rows: directions of perigee and semi-latus rectum, plane normal
+H_TARGET, E_TARGET = target_orbit()  # angular momentum and eccentricity vector
 LENGTH, SPEED = ROCKET.Re, (ROCKET.mu / ROCKET.Re) ** 0.5  # units in which mu = 1: 6378 km and 7.9 km/s
-BUFFERS = {
+CONSTANTS = {
     "axes": AXES.tolist(),
     "units": [LENGTH] * 3 + [SPEED] * 3 + [ROCKET.dry_mass],
-    "h_target": (AXES @ H / (LENGTH * SPEED)).tolist(),
-    "e_target": (AXES @ E).tolist(),
+    "h_target": (AXES @ H_TARGET / (LENGTH * SPEED)).tolist(),
+    "e_target": (AXES @ E_TARGET).tolist(),
 }
-BUFFERS = dict.fromkeys(ENV_IDS, BUFFERS)  # what an agent holds, as its checkpoint does
+BUFFERS = dict.fromkeys(ENV_IDS, CONSTANTS)  # what `features` reads as agent.<name>; saved with the weights
 INITIAL_ACTION = [1.0, 0.0, 0.0]  # straight up: a randomly steered rocket never leaves the ground
 
 
 def features(agent, obs):
-    """What the encoder sees of observations (..., 9): the state in the target orbit's axes, and its error, twice.
+    """What the encoder sees of observations (..., 9): the state in the target orbit's axes, and its error.
 
-    h = r x v, e = v x h - r / |r| (mu = 1), E their distance to the target's; tanh(10 E) lets small errors be seen.
-    Frame, scales and tanh are ours: the paper gives the state alone.
+    h = r x v, e = v x h - r / |r| (mu = 1), error = [(h - h_T) / |h_T|, e - e_T], given raw and as tanh(10 error), so
+    that small ones are seen. Frame, scales and tanh are ours: the paper gives the state alone.
     """
     r, v, mass = (obs[..., :7] / agent.units).split([3, 3, 1], dim=-1)
-    t_norm, phase = obs[..., 7:8], obs[..., 8:9]
+    t_norm, phase = obs[..., 7:8], obs[..., 8:9]  # phase: 0 to 1, the paper's 0 to 3
     r = r @ agent.axes.T  # towards the perigee, along the semi-latus rectum, normal to the plane
     v = v @ agent.axes.T
     radius = r.norm(dim=-1, keepdim=True)
@@ -133,24 +134,25 @@ def features(agent, obs):
 
 
 def mean_action(output, action_scale):
-    """The policy's mean, a unit vector: with a free length the policy would choose its noise, and waste fuel by it."""
+    """The policy's mean, a unit vector: the environment normalises the action, a longer mean would be less noise."""
     return F.normalize(output, dim=-1)
 
 
 def set_curriculum(envs, args, progress, refines, std):
-    """What only training changes, all of it ours. The flights start alike: groups of any size may be compared.
+    """What only training changes, all of it ours; returns how many flights in a row have the same start: any number.
 
-    Noise moves a flight's end by about std / 10: R_terminal is as steep as what can be told apart. Burning costs
-    nothing in the first quarter of the updates, all of --mass-weight from 60 % on: precision comes first.
+    Noise std scatters the ends of the flights by about std / 10: R_terminal need not be steeper. Precision comes first,
+    so that burning costs nothing in the first quarter of the updates, and --mass-weight from 60 % on.
     """
-    envs.flights_per_start = args.flights_per_start
     envs.guidance = args.guidance
     envs.terminal_scale = min(TERMINAL_SCALE, std / 8)
-    envs.mass_weight = envs.cutoff * args.mass_weight * min(max((progress - 0.25) / 0.35, 0.0), 1.0)
+    ramp = np.clip((progress - 0.25) / (0.60 - 0.25), 0.0, 1.0)
+    envs.mass_weight = float(envs.cutoff * args.mass_weight * ramp)
+    return args.flights_per_start
 
 
 def precise_enough(episodes, std):
-    """--noise gated: lower the noise once it, not the mean action, makes the sampled episodes miss, or all is near."""
+    """--noise gated: the noise falls once it is what makes the flights miss (0.2 std), or they hardly miss (0.02)."""
     return np.median(episodes["error_norm"]) < max(0.2 * std, 0.02)
 
 
@@ -352,7 +354,7 @@ class Batch:
     rewards: torch.Tensor  # (T, N), scaled
     values: torch.Tensor  # (T, N), the critic's output
     alive: torch.Tensor  # (T, N)
-    memory: torch.Tensor  # (blocks, N, L, d)
+    memory: torch.Tensor  # (blocks, N, L, d), m_0; what follows, encode makes anew from obs, with gradients
     advantages: torch.Tensor | None = None  # (T, N), filled by train, as the returns
     returns: torch.Tensor | None = None  # (T, N), what the critic learns
 
@@ -368,7 +370,7 @@ def rollout(agent, envs, reward_scale, memory_noise):
     batch.obs[:] = torch.as_tensor(next_obs)  # steps that nobody lives to are computed, too: they need a real state
     for t in range(T):  # line 6
         batch.obs[t], batch.alive[t] = torch.as_tensor(next_obs), torch.as_tensor(alive)
-        hidden[t] = agent.encode_step(batch.obs[t], cache, t)  # lines 7 and 10
+        hidden[t] = agent.encode_step(batch.obs[t], cache, t)  # lines 7 and 10: of states, not of actions
         batch.actions[t] = agent.get_policy(hidden[t]).sample()  # line 8
         next_obs, reward, terminated, _, info = envs.step(batch.actions[t].cpu().numpy())  # line 9
         batch.rewards[t] = torch.as_tensor(reward * alive * reward_scale)
@@ -378,7 +380,7 @@ def rollout(agent, envs, reward_scale, memory_noise):
         alive = alive & ~terminated  # an ended environment has started anew; only its first episode counts
         if not alive.any():
             break
-    batch.logprobs, _, batch.values = agent.evaluate_actions(hidden, batch.actions)
+    batch.logprobs, _, batch.values = agent.evaluate_actions(hidden, batch.actions)  # v_t of line 8
     everyone = runs.gathered(episodes)
     return batch, {key: np.concatenate([part[key] for part in everyone]) for key in episodes}
 
@@ -404,7 +406,12 @@ def moments(x, alive, dim):
 
 
 def linear_fit(x, y, alive):
-    """Ridge regression of y (..., G) on x (..., G, k) over the G episodes of a group that live: the fitted y."""
+    """Ridge regression of y (..., G) on x (..., G, k) over the G episodes of a group that live: the fitted y.
+
+    Each episode is in its own fit. Its residual is 1 - l times that of a fit without it, with the leverage l a function
+    of the states at this step alone, not of the action: a state's gradient keeps its direction, extreme states count
+    less. (A fit without it was worse: README.)
+    """
     weight, count = alive.double()[..., None], alive.double().sum(-1)[..., None, None].clamp(min=1)
     x, y = x.double(), y.double()[..., None]
     y_mean = (y * weight).sum(-2, keepdim=True) / count
@@ -416,16 +423,11 @@ def linear_fit(x, y, alive):
 
 
 def returns_baseline(batch, gamma, group):
-    """What of the returns the critic need not learn: V(s, t) = baseline + scale critic(s, t); (T, N) and (T, 1).
+    """b (T, N) and c (T, 1) of V(s, t) = b + c critic(s, t). Ours; with group 1, b = 0 and c = 1, it is the paper.
 
-    Each `group` of episodes that follow one another in the batch began alike. What their returns from step t on have in
-    common, and what is linear in the states that they have reached by then, is the baseline: near one path that is most
-    of it, and a critic's error would drown what small noise changes. Without groups (1) the critic learns the returns
-    themselves, as in the paper.
-
-    The fit holds the episode that it is the baseline of: its residual is (1 - h) times the leave-one-out one. h depends
-    on the states at that step alone, not on the action: each state's gradient keeps its direction, extreme states count
-    less.
+    Each `group` of episodes that follow one another flew the same start. b regresses their returns from step t on
+    linearly on the states that they have reached by then, c is the spread of what is left. With small noise a critic's
+    error is larger than what an action changes; flights of one start, compared with one another, show it.
     """
     if group == 1:
         return torch.zeros_like(batch.rewards), torch.ones_like(batch.rewards[:, :1])
@@ -447,14 +449,15 @@ def explained_variance(prediction, returns, alive):
 def ppo_loss(agent, batch, mb, clip_coef, vf_coef, ent_coef):
     """-L_CLIP + c1 L_VF - c2 H over the living steps of the episodes `mb`; returns it and what is logged.
 
-    The minibatch is that of all processes: the loss is this one's share of its mean, what is logged is the sum.
+    The paper's sum with the sign that raises L_CLIP, and L_VF = 1/2 (V - R)^2. Under torchrun the loss is this
+    process's part of the mean (the gradients are then summed), what is logged is of all.
     """
     alive, advantages = batch.alive[:, mb], batch.advantages[:, mb]
     steps = total(alive.sum())
     mean = lambda x: (x * alive).sum() / steps  # noqa: E731
     hidden = agent.encode(batch.obs[:, mb].transpose(0, 1), batch.memory[:, mb]).transpose(0, 1)  # line 17
     newlogprob, entropy, newvalue = agent.evaluate_actions(hidden, batch.actions[:, mb])
-    logratio = newlogprob - batch.logprobs[:, mb]
+    logratio = (newlogprob - batch.logprobs[:, mb]) * alive  # beyond an episode's end it could overflow
     ratio = logratio.exp()
     clipped = torch.clamp(ratio, 1 - clip_coef, 1 + clip_coef)
     pg_loss = mean(torch.max(-advantages * ratio, -advantages * clipped))
@@ -475,7 +478,7 @@ def linear_schedule(first, last, progress):
 
 
 def begin_refinement(agent, args):
-    """Small noise that is set, not learned, from here on; the critic, whose targets become others, starts from zero."""
+    """From here on the noise is set, not learned; where starts are now flown in groups, V starts as their baseline."""
     if args.log_std_refine is not None:
         nn.init.constant_(agent.actor_logstd, args.log_std_refine)
     for parameter in agent.critic[-1].parameters():
@@ -490,26 +493,26 @@ def train(args, agent, average, optimizer, envs, run):
     last = max(args.total_updates - 1, 1)
     target_kl = math.inf if args.target_kl is None else args.target_kl
     refine_at = math.inf if args.refine_from is None else 1 + math.ceil(args.refine_from * last)
-    for iteration in range(run.progress["total_updates"] + 1, args.total_updates + 1):  # line 2
+    for iteration in range(run.updates_done + 1, args.total_updates + 1):  # line 2
         progress = (iteration - 1) / last
         refines = iteration >= refine_at
         if iteration == refine_at:
             begin_refinement(agent, args)
         agent.actor_logstd.requires_grad_(args.noise == "learned" and not refines)
         std = agent.actor_logstd.exp().mean().item()
-        learning_rate = args.learning_rate * std
-        if args.lr_schedule == "linear":
-            learning_rate = linear_schedule(args.learning_rate, args.learning_rate_final, progress)
+        learning_rate = linear_schedule(args.learning_rate, args.learning_rate_final, progress)
+        if args.lr_schedule == "std":
+            learning_rate = args.learning_rate * std
         optimizer.param_groups[0]["lr"] = learning_rate
         ent_coef = linear_schedule(args.ent_coef, args.ent_coef_final, progress)
         gae_lambda = linear_schedule(args.gae_lambda, args.gae_lambda_final, progress)
-        set_curriculum(envs, args, progress, refines, std)
+        group = set_curriculum(envs, args, progress, refines, std)
 
         # lines 3-13: fly one episode in every environment
         batch, episodes = rollout(agent, envs, args.reward_scale, args.memory_noise)
 
         # line 14: advantages, and what the critic learns
-        baseline, scale = returns_baseline(batch, args.gamma, envs.flights_per_start)
+        baseline, scale = returns_baseline(batch, args.gamma, group)
         values = baseline + scale * batch.values
         advantages, returns = gae(batch.rewards, values, batch.alive, args.gamma, gae_lambda)
         batch.returns = (returns - baseline) / scale
@@ -535,18 +538,16 @@ def train(args, agent, average, optimizer, envs, run):
                 average.update_parameters(agent)
             if losses["approx_kl"] > target_kl:
                 break  # the minibatch that went too far has taken no step, and ends the update
-        losses = {name: torch.stack([logged[name] for logged in log]).mean().item() for name in losses}
-        losses["explained_variance"] = explained_variance(batch.values, batch.returns, batch.alive)
-        losses["baseline_explained_variance"] = explained_variance(baseline, returns, batch.alive)
+        means = {name: torch.stack([logged[name] for logged in log]).mean().item() for name in losses}
+        means["explained_variance"] = explained_variance(batch.values, batch.returns, batch.alive)
+        means["baseline_explained_variance"] = explained_variance(baseline, returns, batch.alive)
 
         # the noise of the next update: linear to its last value, from wherever it is
-        falls = args.noise == "schedule" or refines
-        if args.noise == "gated":
-            falls = precise_enough(episodes, std)
-        if falls:
+        falls = {"learned": refines, "schedule": True, "gated": precise_enough(episodes, std)}
+        if falls[args.noise]:
             updates_left = max(args.total_updates - iteration, 1)
             agent.actor_logstd.data += (args.log_std_final - agent.actor_logstd.data) / updates_left
-        run.end_update(iteration, batch.alive, episodes, losses, learning_rate)
+        run.end_update(iteration, batch.alive, episodes, means, learning_rate)
 
 
 def main(argv):

@@ -49,7 +49,7 @@ RANGES = {  # lowest and highest value of every numeric flag; NaN and infinity a
     **{"flights_per_start": (1, 10**6)},
 }
 CHOICES = {"action_frame": ("local", "eci"), "guidance": ("none", "linear", "knots")}
-CHOICES |= {"noise": ("learned", "schedule", "gated"), "lr_schedule": ("linear", "noise")}
+CHOICES |= {"noise": ("learned", "schedule", "gated"), "lr_schedule": ("linear", "std")}
 NETWORK = ("num_blocks", "embed_dim", "num_heads", "memory_length", "mlp_dim", "hidden_dim")
 MAY_CHANGE_ON_RESUME = {"resume", "cuda", "num_threads"}
 
@@ -274,6 +274,11 @@ class Run:
             self.progress = saved["progress"]
         self.began = time.time() - self.progress["wall_seconds"]
         self.update_began = time.time()
+
+    @property
+    def updates_done(self):
+        """Updates that are learned and counted."""
+        return self.progress["total_updates"]
 
     def __enter__(self):
         self.state = training_state(self.args, self.modules, self.envs, self.progress)
