@@ -28,19 +28,23 @@ from pathlib import Path
 import gymnasium as gym
 import torch
 from matplotlib.figure import Figure
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import FlopCounterMode
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from one_update import one_update, script_args  # noqa: E402
+
 from runs import keep_memory  # noqa: E402
 
 PAPER = {"num_blocks": 6, "embed_dim": 384, "num_heads": 8, "memory_length": 256, "mlp_dim": 384, "hidden_dim": 384}
-PAPER |= {"update_epochs": 16, "num_envs": 8, "num_minibatches": 1}
+PAPER |= {"update_epochs": 16, "num_envs": 8, "num_minibatches": 1, "flights_per_start": 1}
 SIZES = {"di": ("ppo_gtrxl_di", {}), "vdp": ("ppo_gtrxl_vdp", {}), "rocket": ("ppo_gtrxl_rocket", {})}
 SIZES["table1"] = ("ppo_gtrxl_rocket", PAPER)
 GATHERED_SAMPLES = {"table1": 64}  # of a minibatch, where a whole one would need more memory than there is
-NO_STOP = {"target_kl": None, "target_kl_final": None, "lr_schedule": "linear"}  # every minibatch takes its step
+# every minibatch takes its step, with a learning rate of 0, and the noise stays: each epoch finds the same weights
+STILL = {"target_kl": None, "lr_schedule": "linear", "learning_rate": 0.0, "learning_rate_final": 0.0}
 
 
 def timed(function):
@@ -67,20 +71,27 @@ class Workbench:
     def __init__(self, script, **changes):
         self.script = importlib.import_module(script)
         self.epochs = changes.get("update_epochs", self.script.Args().update_epochs)
-        self.args = self.script.Args(**{**changes, **NO_STOP, "update_epochs": 1})
-        torch.manual_seed(self.args.seed)
-        options = {name: getattr(self.args, name) for name in self.script.ENV_OPTIONS}
-        self.envs = gym.make_vec(self.args.env_id, num_envs=self.args.num_envs, **options)
-        self.envs.reset(seed=self.args.seed)
-        self.agent = self.script.make_agent(self.args, self.envs, None)
-        self.modules = self.script.make_modules(self.args, self.agent)
-        self.modules["optimizer"].param_groups[0]["lr"] = 0.0
+        self.args = args = script_args(self.script, **{**changes, **STILL, "update_epochs": 1})
+        args.flights_per_start = min(args.flights_per_start, args.num_envs)
+        args.log_std_final = args.log_std
+        torch.manual_seed(args.seed)
+        options = {name: getattr(args, name) for name in self.script.ENV_OPTIONS}
+        self.envs = gym.make_vec(args.env_id, num_envs=args.num_envs, **options)
+        self.envs.reset(seed=args.seed)
+        self.agent = self.script.Agent(args, self.envs)
+        self.average = AveragedModel(self.agent, multi_avg_fn=get_ema_multi_avg_fn(args.weight_average))
+        self.optimizer = torch.optim.Adam(self.agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
+        self.episodes = None  # the last rollout's
 
     def rollout(self):
-        return self.script.rollout(self.agent, self.envs, self.args.reward_scale, self.args.memory_noise)[0]
+        args = self.args
+        batch, self.episodes = self.script.rollout(self.agent, self.envs, args.reward_scale, args.memory_noise)
+        return batch
 
     def epoch(self, batch):
-        return self.script.update(*self.modules.values(), batch, self.args)
+        """All that `train` does with the episodes: advantages, baseline, one epoch of minibatches, what is logged."""
+        modules = self.agent, self.average, self.optimizer
+        return one_update(self.script, self.args, modules, self.envs, batch, self.episodes)
 
 
 # --- FLOP -------------------------------------------------------------------------------------------------------------
@@ -201,10 +212,10 @@ def gathered_epoch(bench, batch, samples):
         clipped = ratio.clamp(1 - args.clip_coef, 1 + args.clip_coef)
         loss = torch.max(-advantages * ratio, -advantages * clipped).mean() - args.ent_coef * entropy.mean()
         loss = loss + args.vf_coef * 0.5 * (newvalue - batch.returns[t, n]).square().mean()
-        bench.modules["optimizer"].zero_grad()
+        bench.optimizer.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
-        bench.modules["optimizer"].step()
+        bench.optimizer.step()
         taken += len(chosen)
     return (time.perf_counter() - start) * T * N / taken
 

@@ -1,4 +1,4 @@
-"""What several test files share: a vector environment whose episodes end at different times, and a benchmark."""
+"""What several test files share: environments whose episodes end at different times, one update, a benchmark."""
 
 import importlib
 import os
@@ -10,6 +10,9 @@ os.environ["OMP_NUM_THREADS"] = "1"  # two workers on two cores, and whatever th
 import numpy as np
 import pytest
 from gymnasium.spaces import Box
+
+sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
+import one_update  # noqa: E402
 
 
 class UnevenEnvs:
@@ -23,7 +26,7 @@ class UnevenEnvs:
         self.episode_steps = max(lengths) + spare_steps
         high = np.array(u_max)
         self.single_observation_space, self.single_action_space = Box(-1, 1, (3,)), Box(-high, high, dtype=np.float64)
-        self.reward, self.rng = reward, np.random.default_rng(0)
+        self.reward, self.rng, self.flights_per_start = reward, np.random.default_rng(0), 1
 
     def _draw(self):
         self.given_obs.append(self.rng.uniform(-1, 1, (self.num_envs, 3)))
@@ -52,9 +55,13 @@ def uneven_envs():
     return UnevenEnvs
 
 
+def update(script, args, modules, envs, batch, episodes=None, iteration=1):
+    """One update of `script.train` on this batch, in groups of `envs.flights_per_start` and without a curriculum."""
+    group = envs.flights_per_start
+    return one_update.one_update(script, args, modules, envs, batch, episodes, iteration, group)
+
+
 @pytest.fixture(scope="module")
 def robustness():
     """The benchmark as a module that its child processes can import, too."""
-    sys.path.insert(0, folder := str(Path(__file__).parents[1] / "benchmarks"))
-    yield importlib.import_module("robustness")
-    sys.path.remove(folder)
+    return importlib.import_module("robustness")

@@ -1,4 +1,4 @@
-"""PPO of the scripts: GAE, loss, update and schedules against sums, cases and averages written out by hand.
+"""PPO of the scripts: GAE, groups, loss, update, schedules against sums, cases and averages written out by hand.
 
 The scripts' shared sections are the same to the letter (test_scripts.py), so one script stands for all.
 """
@@ -10,6 +10,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from conftest import update
+from one_update import script_args
 from scipy.stats import norm
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
@@ -21,7 +23,8 @@ TINY |= {"log_std": -0.5}
 
 
 def make_args(**changes):
-    return script.Args(**{**TINY, "num_minibatches": 2, "update_epochs": 3, **changes})
+    defaults = {**TINY, "num_minibatches": 2, "update_epochs": 3, "learning_rate": 1e-3}
+    return script_args(script, **{**defaults, **changes})
 
 
 def make_agent(args, envs, dtype=torch.float64):
@@ -32,8 +35,8 @@ def make_agent(args, envs, dtype=torch.float64):
 class RecordingAdam(torch.optim.Adam):
     """Adam that keeps a copy of the weights after each step."""
 
-    def __init__(self, agent, lr=1e-3):
-        super().__init__(agent.parameters(), lr=lr, eps=1e-5)
+    def __init__(self, agent):
+        super().__init__(agent.parameters(), lr=1e-3, eps=1e-5)
         self.agent, self.weights = agent, []
 
     def step(self):
@@ -42,21 +45,22 @@ class RecordingAdam(torch.optim.Adam):
 
 
 class Learner:
-    """What `update` needs, for episodes of the given lengths: agent, average, optimiser and a batch."""
+    """What one update needs, for episodes of the given lengths: agent, average, optimiser and a batch."""
 
     def __init__(self, envs, **changes):
         self.args, self.envs = make_args(**changes), envs
+        envs.flights_per_start = self.args.flights_per_start
         self.agent = make_agent(self.args, envs)
         self.average = AveragedModel(self.agent, multi_avg_fn=get_ema_multi_avg_fn(0.9))
-        self.optimizer = RecordingAdam(self.agent)
+        self.optimizer, self.episodes = RecordingAdam(self.agent), None  # what --noise gated looks at
         self.collect()
 
     def collect(self):
-        self.batch, self.finals = script.rollout(self.agent, self.envs, 1.0, 0.1)
+        self.batch, _ = script.rollout(self.agent, self.envs, 1.0, 0.1)
 
-    def update(self):
+    def update(self, iteration=1):
         modules = self.agent, self.average, self.optimizer
-        return script.update(*modules, self.batch, self.args)
+        return update(script, self.args, modules, self.envs, self.batch, self.episodes, iteration)
 
 
 @pytest.fixture
@@ -65,13 +69,13 @@ def learner(uneven_envs):
 
 
 @pytest.fixture
-def minibatches(monkeypatch):
-    """The episodes of every minibatch, in the order in which `update` asks for their loss."""
+def asked(monkeypatch):
+    """What `train` asks `ppo_loss` for, in this order: the episodes and the three coefficients of every minibatch."""
     seen, loss = [], script.ppo_loss
 
-    def spy(agent, batch, mb, args):
-        seen.append(mb.tolist())
-        return loss(agent, batch, mb, args)
+    def spy(agent, batch, mb, clip_coef, vf_coef, ent_coef):
+        seen.append((mb.tolist(), clip_coef, vf_coef, ent_coef))
+        return loss(agent, batch, mb, clip_coef, vf_coef, ent_coef)
 
     monkeypatch.setattr(script, "ppo_loss", spy)
     return seen
@@ -107,75 +111,182 @@ def test_gae_is_the_direct_sum(gamma, lam):
 
 
 def test_linear_schedule():
-    assert script.linear_schedule(3e-4, 3e-5, 1, 1000) == 3e-4
-    assert script.linear_schedule(3e-4, 3e-5, 1000, 1000) == pytest.approx(3e-5, rel=1e-12)
-    assert script.linear_schedule(1.0, 0.0, 6, 11) == pytest.approx(0.5)
-    assert script.linear_schedule(2.0, 1.0, 1, 1) == 2.0
+    assert script.linear_schedule(3e-4, 3e-5, 0.0) == 3e-4
+    assert script.linear_schedule(3e-4, 3e-5, 1.0) == pytest.approx(3e-5, rel=1e-12)
+    assert script.linear_schedule(1.0, 0.0, 0.5) == pytest.approx(0.5)
 
 
-@pytest.mark.parametrize("iteration, scale", [(1, 12.0), (31, 12**0.5), (61, 1.0), (81, 1.0), (101, 1.0)])
-def test_radius_curriculum(iteration, scale):
-    """From K to 1 over 60 % of the updates, geometrically: half-way in 12^(1/2)."""
+@pytest.mark.parametrize("refine_from", [None, 0.3])
+@pytest.mark.parametrize("progress, scale", [(0.0, 12.0), (0.5, 12**0.5), (1.0, 1.0), (1.1, 1.0), (1.6, 1.0)])
+def test_radius_curriculum(refine_from, progress, scale):
+    """From K to 1 until the refinement, or 60 % of the updates, geometrically: half-way in 12^(1/2)."""
     envs = gym.make_vec("DoubleIntegratorWaypoints-v0", num_envs=1)
-    script.set_curriculum(envs, script.Args(), script.linear_schedule(0.0, 1.0, iteration, 101))
+    until = refine_from or 0.6
+    script.set_curriculum(envs, script.Args(refine_from=refine_from), progress * until, progress >= 1, std=1.0)
     assert envs.radius_scale == pytest.approx(scale)
 
 
-def schedules(iteration, **changes):
-    """`begin_update` of update `iteration` of 11: what it returns, the learning rate and log-std that it set."""
-    args = make_args(learning_rate=1e-3, learning_rate_final=1e-4, ent_coef=0.5, ent_coef_final=0.1, **changes)
-    envs = gym.make_vec(args.env_id, num_envs=1)
-    agent = make_agent(args, envs)
-    optimizer = RecordingAdam(agent, lr=7.0)
-    now = script.begin_update(args, agent, optimizer, envs, (iteration, 11))
-    rate, log_std = optimizer.param_groups[0]["lr"], agent.actor_logstd.item()
-    return now.ent_coef, now.target_kl, now.gae_lambda, rate, log_std
+@pytest.fixture
+def schedules(learner, asked, monkeypatch):
+    """The entropy's coefficient, lambda and the learning rate that update `iteration` of 11 uses."""
+    lambdas, gae = [], script.gae
+    monkeypatch.setattr(script, "gae", lambda *inputs: [lambdas.append(inputs[-1]), gae(*inputs)][1])
+    ends = {"learning_rate": 2e-3, "learning_rate_final": 1e-3, "ent_coef": 0.5, "ent_coef_final": 0.1}
+
+    def of_update(iteration, **changes):
+        run = learner(**{**ends, **changes}, total_updates=11)
+        rates, step = [], run.optimizer.step
+        run.optimizer.step = lambda: [rates.append(run.optimizer.param_groups[0]["lr"]), step()]
+        asked.clear(), lambdas.clear()
+        run.update(iteration)
+        assert len({minibatch[1:] for minibatch in asked}) == len(set(lambdas)) == len(set(rates)) == 1
+        assert asked[0][1:3] == (run.args.clip_coef, run.args.vf_coef)
+        return asked[0][3], lambdas[0], rates[0]
+
+    return of_update
 
 
-def test_schedules_half_way():
-    """Update 6 of 11 is half-way; the log-std is linear, so the standard deviation falls geometrically."""
-    assert schedules(6) == pytest.approx((0.3, None, 0.95, 5.5e-4, -0.5))
-    ends = {"target_kl": 0.03, "target_kl_final": 0.01, "gae_lambda": 0.9, "gae_lambda_final": 1.0}
-    assert schedules(6, noise="schedule", log_std_final=-3.5, **ends) == pytest.approx((0.3, 0.02, 0.95, 5.5e-4, -2.0))
-    assert schedules(11, **ends) == pytest.approx((0.1, 0.01, 1.0, 1e-4, -0.5))
-    assert schedules(6, noise="gated", lr_schedule="kl", target_kl=0.03) == pytest.approx((0.3, 0.03, 0.95, 7.0, -0.5))
+def test_schedules_half_way(schedules):
+    """Update 6 of 11 is half-way, 11 the end."""
+    lambdas = {"gae_lambda": 0.9, "gae_lambda_final": 1.0}
+    assert schedules(1, **lambdas) == pytest.approx((0.5, 0.9, 2e-3))
+    assert schedules(6, **lambdas) == pytest.approx((0.3, 0.95, 1.5e-3))
+    assert schedules(11, **lambdas) == pytest.approx((0.1, 1.0, 1e-3))
+    assert schedules(6, gae_lambda=0.7)[1] == 0.7
 
 
-@pytest.mark.parametrize("kl, rate", [(0.005, 6e-4), (0.012, 5e-4), (0.03, 5e-4 / 1.3), (0.0, 6e-4)])
-def test_learning_rate_follows_the_kl(uneven_envs, kl, rate):
-    """Towards half of the limit 0.02: unchanged within a factor of 1.5 of it, and never beyond its two ends."""
-    args = make_args(lr_schedule="kl", learning_rate=1e-3, learning_rate_final=1e-5, target_kl=0.02)
-    optimizer = RecordingAdam(make_agent(args, uneven_envs([1])), lr=5e-4)
-    script.end_update(args, None, optimizer, {}, kl)
-    assert optimizer.param_groups[0]["lr"] == pytest.approx(rate)
-    for _ in range(50):
-        script.end_update(args, None, optimizer, {}, kl)
-    assert optimizer.param_groups[0]["lr"] == pytest.approx(1e-3 if rate > 5e-4 else 1e-5 if rate < 5e-4 else 5e-4)
+@pytest.mark.parametrize("log_std", [0.0, -1.5, -8.0])
+def test_learning_rate_follows_the_noise(schedules, log_std):
+    """--lr-schedule std: what a step does to the log-probabilities goes with its size over the standard deviation."""
+    fixed = {"noise": "schedule", "log_std": log_std, "log_std_final": log_std}
+    assert schedules(6, lr_schedule="std", **fixed)[2] == pytest.approx(2e-3 * math.exp(log_std))
 
 
-@pytest.mark.parametrize("hits, factor", [(17, 0.9), (16, 1.0), (10, 1.0), (9, 1 / 0.9)])
-def test_gated_noise_follows_success(uneven_envs, hits, factor):
-    """17 of 20 episodes are 85 %, 10 are half; it stays between --log-std-final and --log-std."""
-    args = make_args(noise="gated", noise_decay=0.9, log_std=0.0, log_std_final=-1.0)
-    agent = make_agent(args, uneven_envs([1]))
-    agent.actor_logstd.data.fill_(-0.5)
-    optimizer, episodes = RecordingAdam(agent), {"hit": np.arange(20)[:, None] < hits}
-    script.end_update(args, agent, optimizer, episodes, 0.0)
-    assert agent.actor_logstd.item() == pytest.approx(-0.5 + math.log(factor))
-    for _ in range(20):
-        script.end_update(args, agent, optimizer, episodes, 0.0)
-    assert agent.actor_logstd.item() == pytest.approx({17: -1.0, 9: 0.0}.get(hits, -0.5))
+# --- who sets the noise -----------------------------------------------------------------------------------------------
+
+
+def log_stds(run, hits):
+    """The log-std after each of the updates, of which these parts of the 20 sampled episodes hit their circles."""
+    seen = []
+    for iteration, share in enumerate(hits, start=1):
+        run.episodes = {"hit": np.arange(20)[:, None] < share * 20}
+        run.update(iteration)
+        seen.append(run.agent.actor_logstd.item())
+    return seen
+
+
+def test_scheduled_noise_is_linear(learner):
+    """From --log-std in update 1 to --log-std-final in the last one, whatever the episodes do."""
+    run = learner(noise="schedule", log_std=-0.5, log_std_final=-2.5, total_updates=11)
+    assert log_stds(run, [0.0] * 11) == pytest.approx([*np.linspace(-0.5, -2.5, 11)[1:], -2.5])
+
+
+def test_gated_noise_that_never_waits_is_the_scheduled_one(learner):
+    run = learner(noise="gated", log_std=-0.5, log_std_final=-2.5, total_updates=11)
+    assert log_stds(run, [1.0] * 11) == pytest.approx([*np.linspace(-0.5, -2.5, 11)[1:], -2.5])
+
+
+def test_gated_noise_waits_for_the_episodes(learner):
+    """17 of 20 are 85 %. Held it stays and never rises; then it falls to its end by equal steps over what is left."""
+    run = learner(noise="gated", log_std=-0.5, log_std_final=-2.5, total_updates=11)
+    hits = [0.8, 0.0, 0.85, 0.8, 0.8, 0.8, 0.85, 0.9, 1.0, 1.0, 1.0]
+    third = -0.5 - 2.0 / 8  # of eight updates left after the third
+    falling = [third + (-2.5 - third) * k / 4 for k in (1, 2, 3, 4)]  # four left after the seventh
+    assert log_stds(run, hits) == pytest.approx([-0.5, -0.5, *[third] * 4, *falling, -2.5])
+
+
+def test_noise_falls_from_wherever_it_is(learner):
+    """A checkpoint's log-std may lie on either side of the last one."""
+    for first in (-1.0, -4.0):
+        run = learner(noise="schedule", log_std=first, log_std_final=-2.0, total_updates=3)
+        assert log_stds(run, [0.0] * 3) == pytest.approx([(first - 2.0) / 2, -2.0, -2.0])
+
+
+def test_noise_reaches_minus_eight(learner):
+    """The policy samples with what the schedule ends at: a standard deviation of 3e-4."""
+    run = learner(noise="schedule", log_std_final=-8.0, total_updates=2)
+    assert log_stds(run, [0.0] * 2) == pytest.approx([-8.0, -8.0])
+    std = run.agent.get_policy(torch.zeros(1, 8, dtype=torch.float64)).stddev
+    assert std.item() == pytest.approx(math.exp(-8.0))
 
 
 @pytest.mark.parametrize("noise", ["learned", "schedule", "gated"])
 def test_only_learned_noise_is_learned(learner, noise):
-    run = learner(noise=noise)
+    run = learner(noise=noise, log_std_final=TINY["log_std"])
     before = run.agent.actor_logstd.clone()
     run.update()
     assert torch.equal(run.agent.actor_logstd, before) == (noise != "learned")
+    assert (run.agent.actor_logstd.grad is None) == (noise != "learned")
 
 
-# --- returns normalised by time ---------------------------------------------------------------------------------------
+# --- refinement -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("refine_from, begins", [(0.0, [1]), (0.5, [6]), (0.51, [7]), (1.0, [11]), (None, [])])
+def test_refinement_begins_once(learner, monkeypatch, refine_from, begins):
+    """Of 11 updates; from then on the noise is no longer learned, and the environments know."""
+    run, seen, told = learner(refine_from=refine_from, total_updates=11), [], []
+    monkeypatch.setattr(script, "begin_refinement", lambda *inputs: seen.append(iteration))
+    for iteration in range(1, 12):
+        run.update(iteration)
+        told.append(not run.agent.actor_logstd.requires_grad)
+    assert seen == begins
+    assert told == [bool(begins) and iteration >= begins[0] for iteration in range(1, 12)]
+
+
+def test_refinement_in_the_middle_of_a_run(learner, asked):
+    """The critic's head is zero when the first minibatch is asked for; a resume after the beginning leaves it alone."""
+    run = learner(refine_from=0.5, log_std_refine=-3.0, total_updates=11)
+    seen, encode = [], run.agent.encode
+
+    def watch(*inputs):
+        last = run.agent.critic[-1]
+        seen.append((bool(last.weight.any() or last.bias.any()), run.agent.actor_logstd.item()))
+        return encode(*inputs)
+
+    run.agent.encode = watch
+    before = copy.deepcopy(run.agent.state_dict())
+    run.update(6)
+    assert seen[0] == (False, pytest.approx(-3.0)) and all(moved for moved, _ in seen[1:])
+    run.agent.load_state_dict(before)
+    del seen[:]
+    run.update(7)
+    assert seen[0] == (True, TINY["log_std"])
+
+
+def test_refinement_leaves_the_policy(learner):
+    run = learner(log_std_refine=-3.0)
+    hidden = torch.randn(5, 8, dtype=torch.float64)
+    mean = run.agent.get_mean_action(hidden)
+    script.begin_refinement(run.agent, run.args)
+    assert torch.equal(run.agent.get_mean_action(hidden), mean) and not run.agent.critic(hidden).any()
+
+
+@pytest.mark.parametrize("log_std_refine", [-2.0, None])
+def test_noise_of_the_refinement(learner, log_std_refine):
+    """Learned until update 5 of 11, then set, or left where it is, from where it falls by equal steps to its end."""
+    settings = {"refine_from": 0.5, "log_std_refine": log_std_refine, "log_std_final": -5.0}
+    run = learner(noise="learned", total_updates=11, **settings)
+    seen = log_stds(run, [0.0] * 11)
+    assert len(set(seen[:5])) == 5 and np.abs(np.array(seen[:5]) - TINY["log_std"]).max() < 0.1
+    first = seen[4] if log_std_refine is None else log_std_refine
+    assert seen[5:] == pytest.approx([*np.linspace(first, -5.0, 6)[1:], -5.0])
+
+
+def test_gated_noise_waits_in_the_refinement_too(learner):
+    run = learner(noise="gated", total_updates=11, refine_from=0.0, log_std_refine=-2.0, log_std_final=-5.0)
+    assert log_stds(run, [0.0] * 11) == [-2.0] * 11
+
+
+@pytest.mark.parametrize("env_id", script.ENV_IDS)
+def test_starts_are_flown_in_groups_in_the_refinement(env_id):
+    envs = gym.make_vec(env_id, num_envs=1)
+    for refines in (False, True, False):
+        group = script.set_curriculum(envs, script.Args(flights_per_start=8), 0.5, refines, std=1.0)
+        assert group == envs.flights_per_start == (8 if refines else 1)
+
+
+# --- groups of flights that began alike -------------------------------------------------------------------------------
 
 
 def monte_carlo(rewards, lengths, gamma):
@@ -187,38 +298,68 @@ def monte_carlo(rewards, lengths, gamma):
     return returns
 
 
-def test_return_norm_time(learner):
-    """By hand, with episodes of different lengths: the statistics, the critic's targets, and V in the advantages."""
-    run = learner(return_norm="time", gamma=0.9, gae_lambda=0.8, norm_adv=False)
-    lengths, critic = run.envs.lengths, run.batch.values.numpy().copy()
-    returns = monte_carlo(run.batch.rewards.numpy(), lengths, 0.9)
-    mean, spread = np.nanmean(returns, axis=1, keepdims=True), np.nanstd(returns, axis=1, keepdims=True)
-    std = np.sqrt(spread**2 + (0.3 * spread.mean()) ** 2 + 1e-8)
-    script.prepare(run.batch, run.args)
-    alive = np.isfinite(returns)
-    np.testing.assert_allclose(run.batch.returns.numpy()[alive], ((returns - mean) / std)[alive], rtol=1e-9)
-    expected = direct_gae(run.batch.rewards.numpy(), mean + std * critic, lengths, 0.9, 0.8)
-    np.testing.assert_allclose(run.batch.advantages.numpy()[alive], expected[alive], rtol=1e-9, atol=1e-12)
+def standardised(x):
+    return (x - x.mean(axis=0)) / (x.std(axis=0) + 1e-6)
 
 
-def test_return_norm_linear(learner):
-    """The fit by NumPy's least squares, ridge and all, over the episodes alive at a step; the rest is as with time."""
-    run = learner(return_norm="linear", gamma=0.9, gae_lambda=0.8, norm_adv=False)
-    lengths, critic, obs = run.envs.lengths, run.batch.values.numpy().copy(), run.batch.obs.numpy()
-    returns = monte_carlo(run.batch.rewards.numpy(), lengths, 0.9)
-    alive, fit = np.isfinite(returns), np.zeros(returns.shape)
-    for t, living in enumerate(alive):
-        x, y, k = obs[t, living], returns[t, living], obs.shape[-1]
-        x = (x - x.mean(axis=0)) / (x.std(axis=0) + 1e-6)
+def direct_fit(obs, returns, group):
+    """Each group's ridge fit at each step, over the episodes that live then, by NumPy's least squares; (T, N)."""
+    fit = np.zeros(returns.shape)
+    for t, first in np.ndindex(len(returns), returns.shape[1] // group):
+        episodes = np.arange(first * group, (first + 1) * group)
+        living = episodes[np.isfinite(returns[t, episodes])]
+        if len(living) == 0:
+            continue
+        x, y, k = standardised(obs[t, living]), returns[t, living], obs.shape[-1]
         rows = np.vstack([x, np.sqrt(0.01 * len(y)) * np.eye(k)])
         slope = np.linalg.lstsq(rows, np.concatenate([y - y.mean(), np.zeros(k)]))[0]
         fit[t, living] = y.mean() + x @ slope
-    spread = np.nanstd(returns - fit, axis=1, keepdims=True)
+    return fit
+
+
+@pytest.mark.parametrize("group", [2, 4, 12])
+def test_groups_are_compared_within_themselves(learner, group):
+    """Episodes of different lengths: baseline, spread, the critic's targets and V in the advantages, by hand."""
+    lengths = (6, 2, 5, 1, 6, 3, 4, 6, 5, 5, 1, 2)
+    run = learner(lengths, flights_per_start=group, gamma=0.9, gae_lambda=0.8, norm_adv=False)
+    critic, obs, rewards = (getattr(run.batch, name).numpy().copy() for name in ("values", "obs", "rewards"))
+    returns = monte_carlo(rewards, lengths, 0.9)
+    alive, fit = np.isfinite(returns), direct_fit(obs, returns, group)
+    spread = np.nanstd(returns - fit, axis=1, keepdims=True)  # of all groups' episodes
     std = np.sqrt(spread**2 + (0.3 * spread.mean()) ** 2 + 1e-8)
-    script.prepare(run.batch, run.args)
-    np.testing.assert_allclose(run.batch.returns.numpy()[alive], ((returns - fit) / std)[alive], rtol=1e-7)
-    expected = direct_gae(run.batch.rewards.numpy(), fit + std * critic, lengths, 0.9, 0.8)
-    np.testing.assert_allclose(run.batch.advantages.numpy()[alive], expected[alive], rtol=1e-7, atol=1e-9)
+    advantages = direct_gae(rewards, fit + std * critic, lengths, 0.9, 0.8)
+    targets = (advantages + std * critic) / std  # the normalised A + V
+    losses = run.update()
+    np.testing.assert_allclose(run.batch.advantages.numpy()[alive], advantages[alive], rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(run.batch.returns.numpy()[alive], targets[alive], rtol=1e-7, atol=1e-9)
+    whole, left = (advantages + fit + std * critic)[alive], (advantages + std * critic)[alive]
+    assert losses["baseline_explained_variance"] == pytest.approx(1 - left.var() / whole.var())
+    assert losses["explained_variance"] == pytest.approx(1 - (targets - critic)[alive].var() / targets[alive].var())
+
+
+def test_one_flight_a_start_is_the_papers(learner):
+    """No baseline: the critic's target is A + V, and its explained variance CleanRL's."""
+    run = learner()
+    baseline, scale = script.returns_baseline(run.batch, 0.99, 1)
+    assert not baseline.any() and (scale == 1).all()
+    assert run.update()["baseline_explained_variance"] == 0.0
+
+
+def test_explained_variance_is_the_critics_alone(learner):
+    """Rewards follow the clock and nothing that is seen: a critic of 0 explains nothing, the baseline nearly all."""
+    run = learner([6] * 40, flights_per_start=40)
+    run.batch.values.zero_()
+    run.batch.rewards[:] = torch.arange(6.0)[:, None] + 0.1 * torch.randn(6, 40)
+    losses = run.update()
+    assert abs(losses["explained_variance"]) < 0.01 < 0.95 < losses["baseline_explained_variance"] <= 1
+
+
+def test_explained_variance_of_a_critic_that_knows(learner):
+    run = learner([6] * 8, flights_per_start=4, gamma=1.0, gae_lambda=1.0)
+    baseline, scale = script.returns_baseline(run.batch, 1.0, 4)
+    returns, _ = script.gae(run.batch.rewards, torch.zeros(6, 8), run.batch.alive, 1.0, 1.0)
+    run.batch.values = (returns - baseline) / scale
+    assert run.update()["explained_variance"] == pytest.approx(1.0)
 
 
 def test_linear_fit_finds_a_line():
@@ -230,19 +371,60 @@ def test_linear_fit_finds_a_line():
     assert fit.dtype == torch.float32 and np.abs(fit.numpy() - y).max() < 0.01 * np.ptp(y)
 
 
-@pytest.mark.parametrize("return_norm", ["time", "linear"])
-def test_return_norm_of_steps_that_no_episode_reached(uneven_envs, return_norm):
-    run = Learner(uneven_envs([3, 2], spare_steps=2), return_norm=return_norm)
+def fitted(x, y):
+    """`linear_fit` of one group, x (G, k), all of it alive."""
+    return script.linear_fit(*(torch.tensor(array[None]) for array in (x, y, np.ones(len(y)))))[0].numpy()
+
+
+def test_residual_is_a_part_of_the_leave_one_out_one_without_states():
+    """The states are all alike, so the ridge has nothing to hold: (1 - 1 / G) of the distance to the others' mean."""
+    y = np.random.default_rng(0).standard_normal(8)
+    others = np.array([np.delete(y, n).mean() for n in range(8)])
+    np.testing.assert_allclose(y - fitted(np.full((8, 3), 7.0), y), (1 - 1 / 8) * (y - others), rtol=1e-9)
+
+
+def test_residual_is_a_part_of_the_leave_one_out_one():
+    """(1 - h) times the residual of the same fit without the episode, and h, its own share in its fit, does not hang on
+    the returns: the baseline takes part of an action's effect away, but turns no state's gradient round."""
+    rng, G, k = np.random.default_rng(0), 12, 3
+    x, y = rng.standard_normal((G, k)), rng.standard_normal(G)
+    design, penalty = np.column_stack([np.ones(G), standardised(x)]), 0.01 * G * np.diag([0.0, 1.0, 1.0, 1.0])
+    for n in range(G):
+        rows, rest = np.delete(design, n, axis=0), np.delete(y, n)
+        without = design[n] @ np.linalg.solve(rows.T @ rows + penalty, rows.T @ rest)
+        bump = np.eye(G)[n]
+        h, h_of_others = fitted(x, y + bump)[n] - fitted(x, y)[n], fitted(x, bump)[n]
+        assert h == pytest.approx(h_of_others, rel=1e-9) and 0 < h < 1
+        assert (y - fitted(x, y))[n] == pytest.approx((1 - h) * (y[n] - without), rel=1e-6)
+
+
+@pytest.mark.parametrize("group", [1, 2])
+def test_steps_that_no_episode_reached(uneven_envs, group):
+    run = Learner(uneven_envs([3, 2, 1, 1], spare_steps=2), flights_per_start=group)
     losses = run.update()
     assert np.isfinite(list(losses.values())).all() and run.batch.returns.isfinite().all()
+
+
+@pytest.mark.parametrize("env_id", script.ENV_IDS)
+def test_flights_of_a_group_share_their_start_and_nothing_else(env_id):
+    args = make_args(env_id=env_id, flights_per_start=3)
+    envs = gym.make_vec(env_id, num_envs=6)
+    envs.reset(seed=1)
+    script.set_curriculum(envs, args, 0.0, True, std=1.0)
+    batch, _ = script.rollout(make_agent(args, envs), envs, 1.0, 0.1)
+    first, second = batch.obs[0, :3], batch.obs[0, 3:]
+    assert (first == first[0]).all() and (second == second[0]).all() and (first[0, :2] != second[0, :2]).all()
+    for own in (batch.actions[0, :, 0], batch.logprobs[0], batch.obs[1, :, 1], batch.rewards[1]):
+        assert len(own.unique()) == 6
+    assert len(batch.memory[0, :, 0, 0].unique()) == 6
 
 
 # --- policy -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("logstd, used", [(-0.5, -0.5), (7.0, 0.5), (-9.0, -5.0)])
+@pytest.mark.parametrize("logstd, used", [(-0.5, -0.5), (7.0, 0.5), (-9.0, -8.0)])
 def test_policy_is_a_gaussian_in_the_actions_unit(uneven_envs, logstd, used):
-    """SciPy's densities, and the entropy log(sigma sqrt(2 pi e)) a component; the log-std is clamped to [-5, 0.5]."""
+    """SciPy's densities, and the entropy log(sigma sqrt(2 pi e)) a component; the log-std is clamped to [-8, 0.5]."""
     agent = make_agent(make_args(), uneven_envs([1], u_max=(4.0, 0.5)))
     torch.nn.init.constant_(agent.actor_logstd, logstd)
     hidden = torch.randn(2000, 8, dtype=torch.float64)
@@ -284,8 +466,7 @@ def hand_made_batch():
 
 
 def test_loss_is_the_hand_computed_one():
-    args = make_args(clip_coef=0.2, vf_coef=0.25, ent_coef=0.01)
-    loss, losses = script.ppo_loss(PrescribedAgent(), hand_made_batch(), torch.tensor([0, 1]), args)
+    loss, losses = script.ppo_loss(PrescribedAgent(), hand_made_batch(), torch.tensor([0, 1]), 0.2, 0.25, 0.01)
     # L_CLIP, min(r A, clip(r) A) of the five living steps: 1.2, -0.8, 0.5, -1.5, 2.2
     assert losses["policy_loss"].item() == pytest.approx(-(1.2 - 0.8 + 0.5 - 1.5 + 2.2) / 5)
     # half the squared errors 1, 16, 0, 4, 1
@@ -299,34 +480,36 @@ def test_loss_is_the_hand_computed_one():
 
 
 def test_loss_of_a_minibatch_reads_only_its_episodes():
-    args = make_args(clip_coef=0.2, vf_coef=0.25, ent_coef=0.01)
-    _, losses = script.ppo_loss(PrescribedAgent(), hand_made_batch(), torch.tensor([1]), args)
+    _, losses = script.ppo_loss(PrescribedAgent(), hand_made_batch(), torch.tensor([1]), 0.2, 0.25, 0.01)
     assert losses["policy_loss"].item() == pytest.approx(-(-0.8 - 1.5) / 2)
     assert losses["value_loss"].item() == pytest.approx((16 + 4) / 2 / 2)
 
 
 def test_dead_steps_do_not_touch_the_gradient(learner):
-    """Change all that was stored after an episode's end: loss and gradient stay."""
+    """Change all that was stored after an episode's end, also beyond what `exp` can hold: loss and gradient stay."""
     gradients = []
-    for garbage in (0.0, 3.0):
+    for garbage, unlikely in ((0.0, 0.0), (3.0, 0.0), (0.0, 1e9)):
         run = learner([6, 2, 5])
         dead = run.batch.alive == 0
         for name in ("obs", "actions", "logprobs", "rewards", "values"):
             getattr(run.batch, name)[dead] += garbage
+        run.batch.logprobs[dead] -= unlikely
         gae = script.gae(run.batch.rewards, run.batch.values, run.batch.alive, 0.99, 0.95)
         run.batch.advantages, run.batch.returns = gae
-        loss, _ = script.ppo_loss(run.agent, run.batch, torch.arange(3), run.args)
+        loss, _ = script.ppo_loss(run.agent, run.batch, torch.arange(3), 0.2, 0.2, 1e-3)
         loss.backward()
         gradients.append([loss.detach(), *(p.grad for p in run.agent.parameters() if p.grad is not None)])
-    torch.testing.assert_close(*gradients, rtol=0, atol=1e-12)
+    for changed in gradients[1:]:
+        torch.testing.assert_close(changed, gradients[0], rtol=0, atol=1e-12)
     assert max(gradient.abs().max() for gradient in gradients[0][1:]) > 1e-3
 
 
 # --- update -----------------------------------------------------------------------------------------------------------
 
 
-def test_minibatches_cover_each_episode_once_an_epoch(learner, minibatches):
+def test_minibatches_cover_each_episode_once_an_epoch(learner, asked):
     learner(num_minibatches=3, update_epochs=4).update()
+    minibatches = [episodes for episodes, *_ in asked]
     assert [len(mb) for mb in minibatches] == [3, 2, 2] * 4
     epochs = [sum(minibatches[k : k + 3], []) for k in range(0, 12, 3)]
     assert all(sorted(epoch) == list(range(7)) for epoch in epochs)
@@ -453,8 +636,7 @@ def test_rewards_are_scaled_in_training_and_logged_unscaled():
 def test_one_step_bandit(uneven_envs):
     """Reward -(a - 1)^2: one update makes a = 1 likelier, twenty move the mean to it."""
     envs = uneven_envs([1] * 64, reward=lambda action: -((action[:, 0] - 1) ** 2))
-    run = Learner(envs, num_minibatches=2, update_epochs=4)
-    run.optimizer = RecordingAdam(run.agent, lr=1e-2)
+    run = Learner(envs, num_minibatches=2, update_epochs=4, learning_rate=1e-2)
 
     def best_action():
         hidden = run.agent.encode(run.batch.obs.transpose(0, 1), run.batch.memory)

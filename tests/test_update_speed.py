@@ -2,21 +2,16 @@
 
 import importlib
 import re
-import sys
-from pathlib import Path
 
 import pytest
 import torch
 
-ROOT = Path(__file__).parent.parent
 TINY = {"num_envs": 3, "num_minibatches": 2, "num_blocks": 2, "embed_dim": 8, "num_heads": 2, "memory_length": 20}
 
 
 @pytest.fixture(scope="module")
 def speed():
-    sys.path.insert(0, str(ROOT / "benchmarks"))
-    yield importlib.import_module("update_speed")
-    sys.path.remove(str(ROOT / "benchmarks"))
+    return importlib.import_module("update_speed")
 
 
 @pytest.mark.parametrize("size", ["di", "vdp", "rocket"])

@@ -1,0 +1,46 @@
+"""One update of a script's flat `train` on episodes that are given: for tests and timings of the learning alone."""
+
+from __future__ import annotations
+
+import contextlib
+from unittest import mock
+
+
+class UpdateDone(Exception):
+    """Ends `train` after the update."""
+
+
+class OneUpdate:
+    """In place of `runs.Run`: `train` begins with update `iteration` and ends after it, its losses are kept."""
+
+    def __init__(self, iteration):
+        self.updates_done, self.losses = iteration - 1, None
+
+    def end_update(self, iteration, alive, episodes, losses, learning_rate):
+        self.losses = losses
+        raise UpdateDone
+
+
+def script_args(script, **changes):
+    """A script's Args as `runs.parse_args` leaves them: a last value that is not given is the first."""
+    args = script.Args(**changes)
+    if args.gae_lambda_final is None:
+        args.gae_lambda_final = args.gae_lambda
+    return args
+
+
+def one_update(script, args, modules, envs, batch, episodes=None, iteration=1, group=None):
+    """All that update `iteration` of `script.train` does but for its rollout; returns its losses.
+
+    modules: agent, average, optimiser. `batch` and `episodes` stand for what `rollout` returns; without episodes they
+    are not asked how precise they are. With a `group` the environments have no curriculum, and need only `num_envs`.
+    """
+    given = {"rollout": lambda *inputs: (batch, episodes)}
+    if episodes is None:
+        given["precise_enough"] = lambda *inputs: False
+    if group is not None:
+        given["set_curriculum"] = lambda *inputs: group
+    run = OneUpdate(iteration)
+    with contextlib.suppress(UpdateDone), mock.patch.multiple(script, **given):
+        script.train(args, *modules, envs, run)
+    return run.losses
