@@ -13,10 +13,12 @@ import pytest
 import torch
 import torch.distributed as dist
 import torch.multiprocessing as multiprocessing
-from conftest import UnevenEnvs
+from conftest import UnevenEnvs, update
+from one_update import script_args
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 import ppo_gtrxl_di as script
+import runs
 
 ROOT = Path(__file__).parent.parent
 LENGTHS = [6, 2, 5, 1, 6, 3, 4, 6]  # the first half flies 14 steps, the second 19: means over ranks would be wrong
@@ -39,8 +41,10 @@ def learn(rank, world, folder, settings):
     torch.set_num_threads(1)
     if world > 1:
         dist.init_process_group("gloo", init_method=f"file://{folder}/meet", rank=rank, world_size=world)
-    args = script.Args(**SIZES, num_minibatches=2, update_epochs=2, **settings)
+    settings = {"learning_rate": 1e-3, **settings}
+    args = script_args(script, **SIZES, num_minibatches=2, update_epochs=2, **settings)
     envs = UnevenEnvs(LENGTHS)
+    envs.num_envs, envs.flights_per_start = len(LENGTHS) // world, args.flights_per_start
     torch.manual_seed(0)
     agent = script.Agent(args, envs)
     batch = torch.load(f"{folder}/batch.pt", weights_only=False)
@@ -51,22 +55,29 @@ def learn(rank, world, folder, settings):
     batch = share(batch, slice(rank * half, (rank + 1) * half)) if world > 1 else batch
     average = AveragedModel(agent, multi_avg_fn=get_ema_multi_avg_fn(0.9))
     optimizer = torch.optim.Adam(agent.parameters(), lr=1e-3, eps=1e-5)
-    gradients, step = [], optimizer.step
+    gradients, step, loss, reduce, exchanges = [], optimizer.step, script.ppo_loss, dist.all_reduce, []
 
     def record():
         gradients.append({name: p.grad.clone() for name, p in agent.named_parameters() if p.grad is not None})
         step()
 
-    optimizer.step = record
-    losses = script.update(agent, average, optimizer, batch, args)
+    def count(tensor):
+        if exchanges:  # the first minibatch has begun, what came before is the advantages'
+            exchanges[-1] += 1
+        reduce(tensor)
+
+    optimizer.step, dist.all_reduce = record, count
+    script.ppo_loss = lambda *inputs: [exchanges.append(0), loss(*inputs)][1]
+    losses = update(script, args, (agent, average, optimizer), envs, batch)
+    assert world == 1 or 1 <= max(exchanges[:-1]) <= 3, exchanges  # the last is counted with what is logged
     saved = {"gradients": gradients, "weights": agent.state_dict(), "losses": losses, "advantages": batch.advantages}
     torch.save({**saved, "alive": batch.alive, "returns": batch.returns}, f"{folder}/{world}_{rank}.pt")
 
 
 @pytest.mark.parametrize(
     "settings",
-    [{}, {"return_norm": "linear", "gamma": 1.0}, {"target_kl": 1e-3, "learning_rate": 0.01}],
-    ids=["plain", "return_norm", "kl_stop"],
+    [{}, {"flights_per_start": 2, "gamma": 1.0}, {"target_kl": 1e-3, "learning_rate": 0.01}],
+    ids=["plain", "groups", "kl_stop"],
 )
 def test_two_processes_learn_what_one_does(tmp_path, settings):
     torch.manual_seed(0)
@@ -143,13 +154,30 @@ def test_torchrun_death_and_resume(tmp_path):
     assert alone.returncode == 1 and "it was trained by 2 processes" in alone.stderr
 
 
+def parse(*argv):
+    return runs.parse_args(script.Args, argv, script.ENV_OPTIONS, script.BUFFERS)[0]
+
+
 def test_more_processes_than_environments(monkeypatch):
     monkeypatch.setenv("WORLD_SIZE", "4")
     with pytest.raises(SystemExit, match="--num-envs 3: must be at least the number of processes, 4"):
-        script.parse_args(["--num-envs=3"])
+        parse("--num-envs=3")
     with pytest.raises(SystemExit, match=r"--num-minibatches 3: must be at most --num-envs 8 / 4 processes"):
-        script.parse_args(["--num-envs=8", "--num-minibatches=3"])
-    assert script.parse_args(["--num-envs=8"])[0].num_minibatches == 2
+        parse("--num-envs=8", "--num-minibatches=3")
+    assert parse("--num-envs=8").num_minibatches == 2
+
+
+def test_every_process_flies_whole_groups(monkeypatch):
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    with pytest.raises(SystemExit, match="--flights-per-start 4: must divide --num-envs 12 / 2 processes"):
+        parse("--num-envs=12", "--flights-per-start=4")
+    assert parse("--num-envs=12", "--flights-per-start=3").flights_per_start == 3
+
+
+def test_shares_of_different_sizes(monkeypatch):
+    """Without groups three and two environments are as good as any."""
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    assert parse("--num-envs=5").flights_per_start == 1
 
 
 def test_moments_are_those_of_the_living(monkeypatch):
