@@ -13,7 +13,9 @@ import runpy
 import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -34,6 +36,11 @@ STEPS |= {"RocketAscent-v0": 481, "RocketAscentCutoff-v0": 481}
 CASES = [(script, env_id) for script in (DI, VDP, ROCKET) for env_id in script.ENV_IDS]
 NETWORK = ["--embed-dim=8", "--num-heads=2", "--num-blocks=1", "--memory-length=4", "--mlp-dim=8", "--hidden-dim=8"]
 TINY = [*NETWORK, "--num-envs=2", "--num-minibatches=2", "--update-epochs=2", "--eval-starts=10"]
+
+
+def parse(*argv, script=DI):
+    """A script's checked arguments."""
+    return runs.parse_args(script.Args, list(map(str, argv)), script.ENV_OPTIONS, script.BUFFERS)[0]
 
 
 def files(folder):
@@ -73,15 +80,24 @@ def test_shared_sections_are_the_same_to_the_letter():
 
 @pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
 def test_sections_are_in_order(path):
-    """Arguments, problem, network, agent, PPO, arguments' checks, checkpoints, main; the paper's names in the heads."""
+    """Arguments, problem, network, agent, PPO, training and main; the paper's names in the heads."""
     heads = [line.strip("#- ") for line in path.read_text().splitlines() if re.fullmatch(r"# .*-{5,}", line)]
-    wanted = ["Problem", "Gated Transformer-XL", "agent", "PPO (Algorithm 1)", "arguments", "checkpoints", "main"]
+    wanted = ["Problem", "Gated Transformer-XL", "agent", "PPO (Algorithm 1)", "training (Algorithm 1) and main"]
     assert len(heads) == len(wanted)
     assert all(word in head for word, head in zip(wanted, heads)), heads
-    assert [head.startswith("Shared") for head in heads] == [False] + [True] * 6
+    assert [head.startswith("Shared") for head in heads] == [False] + [True] * 4
     top = [node.name for node in ast.parse(path.read_text()).body if isinstance(node, ast.ClassDef | ast.FunctionDef)]
-    order = "Args RelativeAttention GTrXLBlock Agent rollout gae ppo_loss update train main".split()
+    order = "Args RelativeAttention GTrXLBlock Agent rollout gae ppo_loss train main".split()
     assert [name for name in top if name in order] == order
+
+
+@pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
+def test_one_flat_loop(path):
+    """The function that asks for the episodes is the one that takes the gradient step: no jump between the two."""
+    functions = [node for node in ast.parse(path.read_text()).body if isinstance(node, ast.FunctionDef)]
+    texts = [ast.unparse(function) for function in functions if function.name != "rollout"]
+    assert sum("rollout(" in text and "optimizer.step()" in text for text in texts) == 1
+    assert sum("rollout(" in text or "optimizer.step()" in text for text in texts) == 1
 
 
 def imported(nodes):
@@ -91,22 +107,33 @@ def imported(nodes):
     return {name.split(".")[0] for name in names}
 
 
+ROOMS = ["rocket", "envs", "baselines", "evaluate", "figures", "runs"]  # each imports only those before it
+
+
 def test_imports_point_one_way():
-    """scripts -> runs -> evaluate -> baselines -> envs; a script is imported by nothing."""
-    rank = {"envs": 0, "baselines": 1, "evaluate": 2, "runs": 3, **{path.stem: 4 for path in SCRIPTS}}
+    """scripts -> runs -> figures -> evaluate -> baselines -> envs -> rocket; a script is imported by nothing.
+
+    Figures are imported where something is drawn: by evaluate's command line, too, and at no module's top.
+    """
+    rank = {name: k for k, name in enumerate(ROOMS)} | {path.stem: len(ROOMS) for path in SCRIPTS}
     for path in ROOT.rglob("*.py"):
         if "tests" in path.parts or any(part.startswith(".") for part in path.relative_to(ROOT).parts):
             continue
-        own = imported(ast.walk(ast.parse(path.read_text()))) & rank.keys()
-        assert all(rank[name] < min(rank.get(path.stem, 4), 4) for name in own), (path, own)
+        tree = ast.parse(path.read_text())
+        top, anywhere = imported(tree.body) & rank.keys(), imported(ast.walk(tree)) & rank.keys()
+        lazily = {"figures"} if path.stem == "evaluate" else set()
+        own = min(rank.get(path.stem, len(ROOMS)), len(ROOMS))
+        assert all(rank[name] < own for name in anywhere - lazily), (path, anywhere)
+        assert "figures" not in top, path
 
 
-@pytest.mark.parametrize(
-    "module, forbidden",
-    [("envs", {"torch", "casadi", "scipy"}), ("baselines", {"torch"}), ("evaluate", {"torch", "casadi"})],
-)
-def test_modules_stay_light(module, forbidden):
-    assert not imported(ast.walk(ast.parse((ROOT / f"{module}.py").read_text()))) & forbidden
+LIGHT = {"rocket": {"torch", "casadi", "scipy", "gymnasium"}, "envs": {"torch", "casadi", "scipy"}}
+LIGHT |= {"baselines": {"torch"}, "evaluate": {"torch", "casadi"}, "figures": {"torch", "casadi"}}
+
+
+@pytest.mark.parametrize("room", [room for room in LIGHT if (ROOT / f"{room}.py").exists()])
+def test_modules_stay_light(room):
+    assert not imported(ast.walk(ast.parse((ROOT / f"{room}.py").read_text()))) & LIGHT[room]
 
 
 def test_casadi_is_imported_only_where_it_solves():
@@ -115,12 +142,14 @@ def test_casadi_is_imported_only_where_it_solves():
 
 @pytest.mark.parametrize("path", sorted(ROOT.glob("*.py")), ids=lambda path: path.name)
 def test_lengths(path):
+    """A script's flat loop and its main may be longer than other functions."""
     text = path.read_text()
     assert max(len(line) for line in text.splitlines()) <= 120
+    long = {"train": 110, "main": 110} if path in SCRIPTS else {}
     functions = [node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.FunctionDef)]
-    assert not [node.name for node in functions if node.end_lineno - node.lineno + 1 > 40]
+    assert not [node.name for node in functions if node.end_lineno - node.lineno + 1 > long.get(node.name, 40)]
     if path in SCRIPTS:
-        assert len(text.splitlines()) <= 700
+        assert len(text.splitlines()) <= 600
 
 
 # Table 1 of the paper: (double integrator, Van der Pol)
@@ -159,9 +188,13 @@ def test_flags_of_the_interface():
     words += " vf_coef max_grad_norm target_kl total_updates num_blocks embed_dim num_heads memory_length mlp_dim"
     words += " hidden_dim learning_rate_final ent_coef_final reward_scale radius_curriculum weight_average log_std"
     words += " checkpoint resume eval_only eval_starts eval_seed eval_json eval_npz eval_every observe_phase"
-    words += " num_threads torch_compile return_norm noise log_std_final gae_lambda_final"
+    words += (
+        " num_threads torch_compile noise log_std_final gae_lambda_final lr_schedule memory_noise flights_per_start"
+    )
+    words += " refine_from log_std_refine"
     fields = {s: {field.name for field in dataclasses.fields(s.Args)} for s in (DI, VDP, ROCKET)}
     assert all(set(words.split()) <= fields[script] | {"radius_curriculum"} for script in fields)
+    assert not {"return_norm", "noise_decay", "target_kl_final"} & fields[DI]
     rocket_only = {"action_frame", "guidance", "mass_weight"}
     assert fields[DI] == fields[VDP] == fields[ROCKET] - rocket_only | {"radius_curriculum"}
 
@@ -170,9 +203,11 @@ def test_flags_of_the_interface():
 
 CHARTS = {f"charts/{name}" for name in ("episodic_return", "episodic_length", "learning_rate", "SPS")}
 LOSSES = "value_loss policy_loss entropy old_approx_kl approx_kl clipfrac explained_variance total_loss"
+LOSSES += " baseline_explained_variance"
+CLOCKS = {"training_seconds", "wall_seconds"}
 RUN_FILES = {"args.json", "training_state.pt", "agent.safetensors", "eval.json", "eval.npz"}
 COMMON_KEYS = "env_id seed eval_seed eval_starts checkpoint_sha256 total_updates global_step wall_seconds device"
-COMMON_KEYS += " torch_version episodic_return reference_episodic_return"
+COMMON_KEYS += " training_seconds torch_version episodic_return reference_episodic_return"
 PHASED_KEYS = "cost_mean reference_cost_mean hit_rate"
 ROCKET_KEYS = """error_norm a_km e i_deg raan_deg argp_deg perigee_km apogee_km a_error_km e_error i_error_deg
     raan_error_deg argp_error_deg final_mass_kg final_time_s mass_ratio reference_mass_kg reference_time_s
@@ -232,7 +267,10 @@ def test_smoke_run_logs_the_tags(smoke):
         assert step == updates[-1] and shown == pytest.approx(float(value), rel=1e-6), tag
     rates = [value for _, value in logged["charts/learning_rate"]]
     first, last = script.Args().learning_rate, script.Args().learning_rate_final
-    assert rates == pytest.approx([first, last], rel=1e-6) if script is not ROCKET else last <= rates[1] <= rates[0]
+    if script is ROCKET:  # it follows the noise, which may have fallen after the first update
+        first *= np.exp(script.Args().log_std)
+        last = rates[1] if rates[1] <= rates[0] else 0.0
+    assert rates == pytest.approx([first, last], rel=1e-6)
     assert [value for _, value in logged["charts/episodic_length"]] == [STEPS[env_id]] * 2
 
 
@@ -242,10 +280,11 @@ def test_smoke_run_saves_the_averaged_weights(smoke):
     state = torch.load(run / "training_state.pt", weights_only=True)
     with safetensors.safe_open(run / "agent.safetensors", "pt") as file:
         metadata, weights = file.metadata(), {name: file.get_tensor(name) for name in file.keys()}
-    assert metadata.keys() == {"env_id", "args", "seed", "total_updates", "global_step", "wall_seconds"}
+    assert metadata.keys() == {"env_id", "args", "seed", "total_updates", "global_step", *CLOCKS}
     assert json.loads(metadata["args"]) == json.loads((run / "args.json").read_text()) == state["args"]
     assert (metadata["env_id"], metadata["seed"], metadata["total_updates"]) == (env_id, "1", "2")
-    assert metadata["global_step"] == str(8 * STEPS[env_id]) and float(metadata["wall_seconds"]) > 0
+    assert metadata["global_step"] == str(8 * STEPS[env_id])
+    assert 0 < float(metadata["training_seconds"]) <= float(metadata["wall_seconds"])
     assert weights.keys() == state["agent"].keys()
     for name, tensor in weights.items():
         assert torch.equal(tensor, state["average"][f"module.{name}"]), name
@@ -266,7 +305,7 @@ def test_eval_only_repeats_the_runs_evaluation(smoke, tmp_path, monkeypatch, cap
     with np.load("a.npz") as again, np.load(run / "eval.npz") as first:
         assert again.keys() == first.keys()
         assert all(np.array_equal(again[key], first[key]) for key in first)
-    table = output[output.index(f"{env_id}: ") :]
+    table = output[output.index(f"{env_id}: ") : output.rindex("run folder: ")]
     assert table in capsys.readouterr().out
 
 
@@ -284,8 +323,40 @@ def trained(tmp_path_factory):
 
 
 def test_capture_video_draws_the_figures(trained):
-    assert {path.name for path in (trained / "figures").iterdir()} == {"training.png", "trajectories.png", "costs.png"}
+    names = {"training.png", "trajectories.png", "costs.png", "cost_error.png"}
+    assert {path.name for path in (trained / "figures").iterdir()} == names
     assert all(path.read_bytes().startswith(b"\x89PNG") for path in (trained / "figures").iterdir())
+
+
+def test_hyperparameters_are_logged_as_text(trained):
+    """CleanRL's table of all arguments."""
+    events = EventAccumulator(str(trained))
+    events.Reload()
+    (event,) = events.Tensors("hyperparameters/text_summary")
+    (text,) = event.tensor_proto.string_val
+    args = json.loads((trained / "args.json").read_text())
+    assert text.decode().splitlines() == ["|param|value|", "|-|-|", *(f"|{k}|{v}|" for k, v in args.items())]
+
+
+def test_run_folder_is_printed_at_the_start_and_the_end(smoke):
+    _, folder, _, output, _ = smoke
+    (run,) = (folder / "runs").iterdir()
+    line = f"run folder: {run.relative_to(folder)}"
+    lines = [printed for printed in output.splitlines() if "lowered from" not in printed]
+    assert lines[0] == lines[-1] == line and output.count(line) == 2
+
+
+def test_two_runs_within_a_second(tmp_path, monkeypatch):
+    """Another run of this script has begun in this second, and in the two to come: this one waits for its own."""
+    monkeypatch.chdir(tmp_path)
+    now = int(time.time())
+    taken = {Path(f"runs/DoubleIntegrator-v0__ppo_gtrxl_di__1__{second}") for second in range(now, now + 3)}
+    for folder in taken:
+        folder.mkdir(parents=True)
+    DI.main([*TINY, "--total-updates=1"])
+    (run,) = set(Path("runs").iterdir()) - taken
+    assert (run / "eval.json").exists() and not any(os.listdir(folder) for folder in taken)
+    assert int(run.name.split("__")[-1]) >= now + 3
 
 
 def test_no_save_model_writes_events_only(tmp_path, monkeypatch):
@@ -306,8 +377,8 @@ def test_eval_only_defaults(trained, tmp_path, monkeypatch):
         policy(np.zeros((n, 3)), 0)
         return {"env_id": env_id}, {}
 
-    monkeypatch.setattr(DI.evaluate, "evaluate", evaluate)
-    monkeypatch.setattr(DI.evaluate, "table", lambda metrics: "")
+    monkeypatch.setattr(runs.evaluate, "evaluate", evaluate)
+    monkeypatch.setattr(runs.evaluate, "table", lambda metrics: "")
     DI.main(["--eval-only", f"--checkpoint={trained / 'agent.safetensors'}", "--embed-dim=8", "--eval-seed=7"])
     assert asked == [("DoubleIntegrator-v0", 7, 1000, {"observe_phase": False})]
     assert os.listdir() == []
@@ -321,10 +392,30 @@ def test_checkpoint_starts_training_from_its_weights(trained, tmp_path, monkeypa
     torch.testing.assert_close(second, first, rtol=1e-6, atol=1e-8)  # the average of equal weights rounds
 
 
+@pytest.mark.parametrize("noise", ["learned", "gated", "schedule"])
+def test_log_std_of_a_checkpoint_and_of_the_user(trained, fresh_folder, monkeypatch, noise):
+    """What the first rollout samples with: the checkpoint's, and with --log-std that of the flag."""
+    seen, rollout = [], DI.rollout
+    record = lambda agent, *inputs: [seen.append(agent.actor_logstd.item()), rollout(agent, *inputs)][1]  # noqa: E731
+    monkeypatch.setattr(DI, "rollout", record)
+    checkpoint = trained / "agent.safetensors"
+    for name, flags in (("the checkpoint's", []), ("the user's", ["--log-std=-1.5"])):
+        fresh_folder(name)
+        DI.main([*TINY, f"--checkpoint={checkpoint}", "--total-updates=1", f"--noise={noise}", *flags])
+    assert seen == [safetensors.torch.load_file(checkpoint)["actor_logstd"].item(), -1.5]
+
+
+def test_noise_falls_to_minus_eight(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    DI.main([*TINY, "--total-updates=2", "--noise=schedule", "--log-std-final=-8"])
+    state = torch.load(run_folder() / "training_state.pt", weights_only=True)
+    assert state["agent"]["actor_logstd"].item() == -8.0
+
+
 def test_eval_every_uses_starts_of_its_own(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    seeds, evaluate = [], DI.evaluate.evaluate
-    monkeypatch.setattr(DI.evaluate, "evaluate", lambda *a, **k: [seeds.append(a[2]), evaluate(*a, **k)][1])
+    seeds, evaluate = [], runs.evaluate.evaluate
+    monkeypatch.setattr(runs.evaluate, "evaluate", lambda *a, **k: [seeds.append(a[2]), evaluate(*a, **k)][1])
     DI.main([*TINY, "--total-updates=3", "--eval-every=2", "--eval-seed=5"])
     assert len(seeds) == 2 and seeds[1] == 5
     assert seeds[0] > runs.RANGES["eval_seed"][1]  # no --eval-seed reaches it
@@ -357,7 +448,7 @@ def test_run_averages_with_its_decay(tmp_path, monkeypatch, decay):
 TABLE_1_ROCKET = """--num-blocks 6 --embed-dim 384 --num-heads 8 --memory-length 256 --mlp-dim 384 --hidden-dim 384
     --gamma 0.99 --gae-lambda 0.95 --total-updates 5000 --update-epochs 16 --vf-coef 0.8 --learning-rate 1e-4
     --learning-rate-final 5e-6 --lr-schedule linear --target-kl None --ent-coef 1e-3 --ent-coef-final 1e-4
-    --clip-coef 0.12 --return-norm none --noise learned --weight-average 0"""
+    --clip-coef 0.12 --flights-per-start 1 --noise learned --weight-average 0 --gae-lambda-final None"""
 
 
 def test_readme_gives_the_papers_rocket():
@@ -404,11 +495,28 @@ def test_rocket_draws_its_figures(rocket):
     assert {path.name for path in (rocket / "figures").iterdir()} == {"training.png", "trajectory.png", "orbit.png"}
 
 
-@pytest.mark.parametrize("errors, trend", [([0.04] * 6 + [9.0] * 5, -1), ([0.06] * 11, 0), ([0.01] * 5 + [0.2] * 6, 1)])
-@pytest.mark.parametrize("std", [0.25, 0.01])
-def test_rockets_noise_follows_the_median_error(errors, trend, std):
-    """It falls below a fifth of the noise's standard deviation, and rises above a half of it."""
-    assert ROCKET.noise_trend({"error_norm": np.array(errors) * std / 0.25}, std) == trend
+@pytest.mark.parametrize("errors, precise", [([0.04] * 6 + [9.0] * 5, True), ([0.06] * 11, False), ([0.3], False)])
+@pytest.mark.parametrize("std", [0.25, 0.125])
+def test_rockets_noise_follows_the_median_error(errors, precise, std):
+    """It falls below a fifth of the noise's standard deviation."""
+    assert ROCKET.precise_enough({"error_norm": np.array(errors) * std / 0.25}, std) == precise
+
+
+def test_phases_are_one_hot_whatever_their_number(monkeypatch):
+    """Five burns: the environment shows the phases as 0, 1/4 .. 1."""
+    burns = (*ROCKET.ROCKET.burns, ROCKET.ROCKET.burns[-1])
+    monkeypatch.setattr(ROCKET, "ROCKET", dataclasses.replace(ROCKET.ROCKET, burns=burns))
+    agent = SimpleNamespace(**{name: torch.tensor(value) for name, value in ROCKET.BUFFERS["RocketAscent-v0"].items()})
+    obs = torch.tensor([[6.4e6, 0.0, 0.0, 0.0, 7e3, 0.0, 1e4, 0.5, k / 4] for k in range(5)])
+    seen = ROCKET.features(agent, obs)
+    (columns,) = np.nonzero((seen != seen[0]).any(0).numpy())
+    assert len(columns) == 5 and torch.equal(seen[:, columns], torch.eye(5))
+
+
+def test_rockets_noise_falls_wherever_all_is_near():
+    """Errors below 0.02 count as none, however small the noise is."""
+    assert ROCKET.precise_enough({"error_norm": np.array([0.019] * 3)}, 1e-4)
+    assert not ROCKET.precise_enough({"error_norm": np.array([0.021] * 3)}, 1e-4)
 
 
 def test_action_frame_comes_from_the_checkpoint(rocket, tmp_path, monkeypatch, refuses):
@@ -434,14 +542,10 @@ def test_resume_with_the_other_variant(rocket, refuses):
     assert "only --cuda and --num-threads" in message
 
 
-@pytest.mark.parametrize("argv", ["--action-frame=ecef", "--guidance=pitch", "--noise=loud", "--return-norm=all"])
+@pytest.mark.parametrize("argv", ["--action-frame=ecef", "--guidance=pitch", "--noise=loud", "--lr-schedule=all"])
 def test_unknown_choice(refuses, argv):
     name, value = argv.split("=")
     assert re.match(rf"error: {name} {value}: must be one of \w+, ", refuses(argv, script=ROCKET))
-
-
-def test_learning_rate_cannot_follow_a_limit_that_is_not_there(refuses):
-    assert "--lr-schedule kl: needs --target-kl" in refuses("--target-kl", None, script=ROCKET)
 
 
 # --- seeds and resume -------------------------------------------------------------------------------------------------
@@ -450,7 +554,9 @@ def test_learning_rate_cannot_follow_a_limit_that_is_not_there(refuses):
 def state_of(folder):
     """The training state without what may differ between equal trainings: wall time and the --resume flag."""
     state = torch.load(Path(folder) / "training_state.pt", weights_only=True)
-    del state["progress"]["wall_seconds"], state["args"]["resume"]
+    for name in CLOCKS:
+        del state["progress"][name]
+    del state["args"]["resume"]
     return state
 
 
@@ -545,10 +651,10 @@ def assert_resumes(uninterrupted):
     assert run_folder() == run
     assert_same_bits(state_of(run), state)
     resumed = json.loads((run / "eval.json").read_text())
-    for key in metrics.keys() - {"wall_seconds", "checkpoint_sha256"}:
+    for key in metrics.keys() - {*CLOCKS, "checkpoint_sha256"}:
         assert resumed[key] == metrics[key], key
     for tag, values in scalars(run).items():
-        if tag not in ("charts/SPS", "eval/wall_seconds"):
+        if tag not in ("charts/SPS", "eval/training_seconds", "eval/wall_seconds"):
             assert values == curve[tag], tag  # no step twice
 
 
@@ -567,7 +673,7 @@ def test_ctrl_c_and_resume(uninterrupted, fresh_folder, monkeypatch, capsys):
 def test_resume_after_a_crash(uninterrupted, fresh_folder, monkeypatch):
     """Killed in the fourth update, saved after the second: the third is flown again."""
     fresh_folder("crash")
-    monkeypatch.setattr(DI, "SAVE_EVERY", 2)
+    monkeypatch.setattr(runs, "SAVE_EVERY", 2)
     stop_in_update(monkeypatch, 4, RuntimeError("killed"))
     with pytest.raises(RuntimeError, match="killed"):
         DI.main([*TINY, "--total-updates=4"])
@@ -589,13 +695,60 @@ def test_resume_of_a_run_that_began_from_a_checkpoint(trained, fresh_folder, mon
     assert_same_bits(resumed, state_of(run_folder()))
 
 
+REFINES = [*NETWORK, "--num-envs=4", "--num-minibatches=2", "--update-epochs=2", "--eval-starts=10"]
+REFINES += ["--flights-per-start=2", "--refine-from=0.5", "--total-updates=4"]
+
+
+@pytest.mark.parametrize("noise", ["--noise=schedule", "--log-std-refine=-2"])
+@pytest.mark.parametrize("update", [2, 3, 4])
+def test_resume_before_and_in_the_refinement(fresh_folder, monkeypatch, update, noise):
+    """The third and fourth update fly each start twice, with noise that falls: resumed, they do the same."""
+    argv = [*REFINES, noise]
+    fresh_folder("in_one_go")
+    starts, rollout = [], DI.rollout
+    record = lambda *inputs: [starts.append((found := rollout(*inputs))[0].obs[0, :, :2]), found][1]  # noqa: E731
+    with monkeypatch.context() as patch:
+        patch.setattr(DI, "rollout", record)
+        DI.main(argv)
+    assert [len(start.unique(dim=0)) for start in starts] == [4, 4, 2, 2]
+    assert all(torch.equal(start[0::2], start[1::2]) for start in starts[2:])
+    state = state_of(run_folder())
+    assert state["agent"]["actor_logstd"].item() == pytest.approx(-4.0)
+    whole = state, scalars(run_folder()), json.loads((run_folder() / "eval.json").read_text())
+    fresh_folder("interrupted")
+    stop_in_update(monkeypatch, update, KeyboardInterrupt())
+    with pytest.raises(KeyboardInterrupt):
+        DI.main(argv)
+    assert state_of(run_folder())["progress"]["total_updates"] == update - 1
+    assert_resumes(whole)
+
+
+def test_seconds_of_training_and_of_all(fresh_folder, monkeypatch):
+    """An evaluation is no training; both are summed over a resume, which does not count the pause before it."""
+    fresh_folder("seconds")
+    evaluate = runs.evaluate.evaluate
+    monkeypatch.setattr(runs.evaluate, "evaluate", lambda *a, **k: [time.sleep(0.3), evaluate(*a, **k)][1])
+    stop_in_update(monkeypatch, 3, KeyboardInterrupt())
+    began = time.time()
+    with pytest.raises(KeyboardInterrupt):
+        DI.main([*TINY, "--total-updates=4", "--eval-every=1"])
+    first = torch.load(run_folder() / "training_state.pt", weights_only=True)["progress"]
+    assert 0 < first["training_seconds"] <= first["wall_seconds"] - 0.3 < time.time() - began
+    time.sleep(pause := 2.0)
+    DI.main([f"--resume={run_folder()}"])
+    last = json.loads((run_folder() / "eval.json").read_text())
+    for name in CLOCKS:
+        assert first[name] < last[name] < time.time() - began - pause, name
+    assert 0.6 < last["wall_seconds"] - last["training_seconds"]  # two updates after which it was evaluated
+
+
 def test_ctrl_c_in_an_evaluation_saves_too(fresh_folder, monkeypatch):
     fresh_folder("ctrl_c_in_evaluation")
 
     def interrupted(*inputs, **options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(DI.evaluate, "evaluate", interrupted)
+    monkeypatch.setattr(runs.evaluate, "evaluate", interrupted)
     with pytest.raises(KeyboardInterrupt):
         DI.main([*TINY, "--total-updates=2", "--eval-every=1"])
     assert state_of(run_folder())["progress"]["total_updates"] == 1
@@ -661,13 +814,13 @@ def flag(name):
 
 NUMBERS = [f for f in dataclasses.fields(DI.Args) if re.search(r"\b(int|float)\b", str(f.type))]
 POSITIVE = "total_updates num_envs num_minibatches update_epochs num_blocks embed_dim num_heads mlp_dim hidden_dim"
-POSITIVE += " eval_starts reward_scale max_grad_norm target_kl target_kl_final noise_decay radius_curriculum"
+POSITIVE += " eval_starts reward_scale max_grad_norm target_kl radius_curriculum flights_per_start"
 
 
 @pytest.mark.parametrize("field", NUMBERS, ids=lambda field: field.name)
 def test_every_number_has_a_range(refuses, field):
     """NaN, infinities and absurd values in every numeric flag, and zero where nothing can be of size zero."""
-    values = ["-6", "1" + "0" * 20] + (["0"] if field.name in POSITIVE.split() else [])
+    values = ["-9", "1" + "0" * 20] + (["0"] if field.name in POSITIVE.split() else [])
     if "float" in str(field.type):
         values += ["nan", "inf", "-inf"]
     for value in values:
@@ -708,6 +861,8 @@ def test_unknown_id(refuses, script, env_id):
         (["--embed-dim", 9], "--num-heads 2: must divide --embed-dim 9"),
         (["--num-envs", 4, "--num-minibatches", 5], "--num-minibatches 5: must be at most --num-envs 4"),
         (["--num-envs", 4, "--num_minibatches=8"], "--num-minibatches 8: must be at most --num-envs 4"),
+        (["--num-envs", 80, "--flights-per-start", 3], "--flights-per-start 3: must divide --num-envs 80"),
+        (["--num-envs", 4, "--flights-per-start=8"], "--flights-per-start 8: must divide --num-envs 4"),
         (["--eval-only"], "--checkpoint"),
         (["--eval-json", "a.json"], "--eval-json a.json: only with --eval-only"),
         (["--eval-npz", "a.npz"], "--eval-npz a.npz: only with --eval-only"),
@@ -727,9 +882,22 @@ def test_tracking_without_wandb_says_how_to_install_it(refuses, monkeypatch):
 
 def test_minibatches_left_alone_are_lowered(capsys):
     default = DI.Args().num_minibatches
-    args, _ = DI.parse_args(["--num-envs", "2"])
+    args = parse("--num-envs", "2")
     assert args.num_minibatches == 2 < default
     assert capsys.readouterr().out == f"--num-minibatches lowered from {default} to --num-envs 2\n"
+
+
+@pytest.mark.parametrize("num_envs, flights", [(32, 32), (64, 32), (4, 4), (1, 1)])
+def test_flights_per_start_left_alone_are_lowered(capsys, num_envs, flights):
+    """The rocket's 32."""
+    assert parse("--num-envs", num_envs, "--num-minibatches=1", script=ROCKET).flights_per_start == flights
+    line = capsys.readouterr().out
+    assert line.startswith(f"--flights-per-start lowered from 32 to {flights}") if flights < 32 else line == ""
+
+
+@pytest.mark.parametrize("num_envs", [48, 33, 6007])
+def test_flights_per_start_left_alone_divide_the_environments(num_envs):
+    assert num_envs % parse("--num-envs", num_envs, script=ROCKET).flights_per_start == 0
 
 
 def test_unwritable_run_folder(refuses):
@@ -759,7 +927,7 @@ def edited_checkpoint(trained, path, tensors=None, args=None, **metadata):
 
 def test_an_edited_copy_is_read(trained, tmp_path):
     """The edits below are what is refused, not the copying."""
-    DI.parse_args(["--eval-only", f"--checkpoint={edited_checkpoint(trained, tmp_path / 'copy')}"])
+    parse("--eval-only", f"--checkpoint={edited_checkpoint(trained, tmp_path / 'copy')}")
 
 
 def damage(kind, trained, path):
