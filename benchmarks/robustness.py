@@ -34,6 +34,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 import envs  # noqa: E402
 import evaluate  # noqa: E402
+import runs  # noqa: E402
 
 SCRIPTS = [importlib.import_module(f"ppo_gtrxl_{name}") for name in ("di", "vdp", "rocket")]
 NETWORK = ["--embed-dim=8", "--num-heads=2", "--num-blocks=1", "--memory-length=4", "--mlp-dim=8", "--hidden-dim=8"]
@@ -48,7 +49,7 @@ PROCESSES.set_forkserver_preload(["ppo_gtrxl_di"])
 def train(folder, argv, slow_disk):
     """In a child: the double integrator's script, saving after every second update; a slow disk writes for 40 ms."""
     script = importlib.import_module("ppo_gtrxl_di")
-    script.SAVE_EVERY = 2
+    runs.SAVE_EVERY = 2
 
     def write_slowly(path, data):
         data = bytes(data)
@@ -59,7 +60,7 @@ def train(folder, argv, slow_disk):
                 time.sleep(0.002)
 
     if slow_disk:
-        script.evaluate.write_bytes = write_slowly
+        evaluate.write_bytes = write_slowly
     os.chdir(folder)
     sys.stdout = open(os.devnull, "w")
     script.main(argv)
@@ -138,7 +139,7 @@ def outcome(call, *inputs):
 
 
 WORDS = ["", "0", "1", "-1", "3", "4", "8", "1e-3", "0.5", "2.5", "nan", "inf", "-inf", "1e400", "10" * 20, "True"]
-WORDS += ["None", "none", "time", "kl", "gated", "learned", "local", "RocketAscent-v0", "DoubleIntegrator-v0"]
+WORDS += ["None", "none", "schedule", "std", "gated", "learned", "local", "RocketAscent-v0", "DoubleIntegrator-v0"]
 WORDS += ["/", ".", "runs", "nowhere/file", "\0", "ü\n", "--", "-h", "'; rm -rf x", "[1]", "{}", "%s", "VanDerPol-v0"]
 
 
@@ -155,6 +156,11 @@ def random_arguments(rng, script):
     return argv
 
 
+def parse_args(script, argv):
+    """The script's arguments and what it starts from."""
+    return runs.parse_args(script.Args, argv, script.ENV_OPTIONS, script.BUFFERS)
+
+
 def fuzz_arguments(count, seed=0):
     """Random command lines through a script's parsing and checks, in an empty folder, which must stay empty."""
     rng, ended = np.random.default_rng(seed), Counter()
@@ -164,7 +170,7 @@ def fuzz_arguments(count, seed=0):
             script = SCRIPTS[rng.integers(3)]
             argv = random_arguments(rng, script)
             try:
-                ended[outcome(script.parse_args, argv)] += 1
+                ended[outcome(parse_args, script, argv)] += 1
             except BaseException as error:
                 raise AssertionError(f"{script.__name__} {argv}: {error!r}") from error
             assert not os.listdir()
@@ -211,14 +217,15 @@ def hostile_state(rng, state):
 
 def parse_at_once(script, **flags):
     """`parse_args` of these flags without tyro, which takes ten times as long as the rest."""
-    with mock.patch.object(script, "parse", lambda kind, argv: kind(**flags)):
-        return script.parse_args([f"--{name}" for name in flags])
+    with mock.patch.object(runs, "read_flags", lambda kind, argv: (kind(**flags), set(flags))):
+        return parse_args(script, [])
 
 
 def load_checkpoint(script, path):
     """All that --eval-only does with a file before it flies."""
     args, saved = parse_at_once(script, eval_only=True, checkpoint=str(path))
-    script.make_agent(args, gym.make_vec(args.env_id, num_envs=args.num_envs), saved)
+    agent = script.Agent(args, gym.make_vec(args.env_id, num_envs=args.num_envs))
+    runs.load_checkpoint(agent, args, saved)
 
 
 def load_state(script, folder):
@@ -226,7 +233,11 @@ def load_state(script, folder):
     args, saved = parse_at_once(script, resume=str(folder))
     batch = gym.make_vec(args.env_id, num_envs=args.num_envs)
     batch.reset(seed=0)
-    script.restore(saved, Path(folder), script.make_modules(args, script.make_agent(args, batch, saved)), batch)
+    agent = script.Agent(args, batch)
+    runs.load_checkpoint(agent, args, saved)
+    average = script.AveragedModel(agent, multi_avg_fn=script.get_ema_multi_avg_fn(args.weight_average))
+    optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
+    runs.restore(saved, Path(folder), {"agent": agent, "average": average, "optimizer": optimizer}, batch)
 
 
 def fuzz_checkpoints(count, seed=0):
@@ -300,13 +311,13 @@ def resources():
 def soak_in_child(pipe, argv):
     """In a child: train in a temporary folder and send `resources` after every update."""
     script = importlib.import_module("ppo_gtrxl_di")
-    log_update = script.log_update
+    end_update = runs.Run.end_update
 
-    def log_and_send(*inputs):
-        log_update(*inputs)
+    def end_and_send(*inputs):
+        end_update(*inputs)
         pipe.send(resources())
 
-    script.log_update = log_and_send
+    runs.Run.end_update = end_and_send
     sys.stdout = open(os.devnull, "w")
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
         script.main(argv)

@@ -26,6 +26,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 import evaluate  # noqa: E402
+import runs  # noqa: E402
 
 MACHINE = ("cuda", "num_threads", "resume")  # arguments that another start may change
 
@@ -73,7 +74,8 @@ def read_jobs(path):
         results, script, *flags = [*words, ""] if len(words) < 2 else words
         if not (script.endswith(".py") and (ROOT / script).is_file()):
             sys.exit(f"error: {path}, line {number}: {line!r} must be a results folder, a script and its flags")
-        args, _ = importlib.import_module(Path(script).stem).parse_args(flags)
+        kind = importlib.import_module(Path(script).stem)
+        args, _ = runs.parse_args(kind.Args, flags, kind.ENV_OPTIONS, kind.BUFFERS)
         jobs.append(Job(Path(results), [script, *flags], asdict(args)))
     return jobs
 

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import torch
 
+import runs
+
 
 def test_thousand_command_lines(robustness):
     ended = robustness.fuzz_arguments(1000)
@@ -36,7 +38,7 @@ def test_flight_of_weights_that_overflow(robustness, tmp_path, monkeypatch, caps
     state = torch.load(run / "training_state.pt", weights_only=True)
     state["average"]["module.actor.2.weight"].fill_(3e38)
     state["average"]["module.actor.0.bias"].fill_(3e38)
-    script.save_run(run, state)
+    runs.save_run(run, state)
     flags = ["--eval-only", f"--checkpoint={run}/agent.safetensors", "--eval-starts=10"]
     command = [sys.executable, script.__file__, *flags]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60)
