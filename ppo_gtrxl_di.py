@@ -461,7 +461,7 @@ def train(args, agent, average, optimizer, envs, run):
     """
     last = max(args.total_updates - 1, 1)
     target_kl = math.inf if args.target_kl is None else args.target_kl
-    refine_at = math.inf if args.refine_from is None else 1 + math.ceil(args.refine_from * last)
+    refine_at = math.inf if args.refine_from is None else 1 + math.ceil(args.refine_from * last - 1e-9)
     for iteration in range(run.updates_done + 1, args.total_updates + 1):  # line 2
         progress = (iteration - 1) / last
         refines = iteration >= refine_at
