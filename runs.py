@@ -255,8 +255,8 @@ class Run:
     """One run: `with run:` opens its folder and keeps what was learned whatever ends the training, `end_update` counts,
     saves, evaluates and logs, `finish` makes the reported evaluation. Under torchrun only the first process writes.
 
-    `progress` holds the counters; `training_seconds` are those of rollouts and updates, `wall_seconds` all until the end
-    of the last update: evaluations and saves, too.
+    `progress` holds the counters; `training_seconds` are those of rollouts and updates, `wall_seconds` all until the
+    end of the last update: evaluations and saves, too.
     """
 
     def __init__(self, args, saved, agent, average, optimizer, envs, env_options, describe):
