@@ -109,9 +109,8 @@ def parse_args(kind, argv, env_options, buffers):
     elif args.eval_only:
         refuse("checkpoint", None, "must name the agent.safetensors that --eval-only flies")
     check(args, typed, env_ids)
-    for name in ("gae_lambda",):  # a last value that is not given is the first
-        if getattr(args, f"{name}_final") is None:
-            setattr(args, f"{name}_final", getattr(args, name))
+    if args.gae_lambda_final is None:
+        args.gae_lambda_final = args.gae_lambda
     if args.eval_starts is None:
         args.eval_starts = 1000 if args.eval_only else 50
     return args, saved
