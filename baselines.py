@@ -18,6 +18,7 @@ import json
 import os
 import sys
 import time
+import warnings
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
@@ -31,7 +32,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 import envs
-from envs import DOUBLE_INTEGRATOR, PROBLEMS, ROCKET, VAN_DER_POL, Problem, Rocket, fly, rk4
+from envs import DOUBLE_INTEGRATOR, PROBLEMS, ROCKET, ROCKETS, VAN_DER_POL, Mission, Problem, Rocket, fly, rk4
 
 STARTS_PER_PROCESS = 100  # fewer are solved sooner than another process has started
 REPLAY_TOLERANCE = 1e-8  # relative difference between the cost of a program's solution and of its flight
@@ -288,26 +289,26 @@ def waypoint_reference(env_id: str, x0, processes: int | None = None) -> dict:
 
 SEGMENTS = 80
 GAUSS_POINTS = (1 + np.polynomial.legendre.leggauss(4)[0]) / 2  # in (0, 1)
-TILT_TIME = 280.0  # s in which the guess tilts from straight up to the horizon
 
 
 class Ascent(NamedTuple):
     """What is solved: a vehicle, final time free (heaviest) or the table's (least turning), altitude bounds in m."""
 
     key: str
-    rocket: Rocket = ROCKET
+    rocket: Rocket
     free: bool = True
     ceiling: float = np.inf
     floor: float = 1.0  # m
 
 
+PAPER_CEILING = envs.PAPER_MISSION.ceiling  # the paper penalises an overshoot; the bound is ours
 ASCENTS = {
     case.key: case
     for case in (
-        Ascent("free"),
+        Ascent("free", ROCKET),
         Ascent("free_table_isp", replace(ROCKET, table_isp=True)),
-        Ascent("fixed", free=False),
-        Ascent("fixed_capped", free=False, ceiling=250e3),  # the paper penalises an overshoot; the bound is ours
+        Ascent("fixed", ROCKET, free=False),
+        Ascent("fixed_capped", ROCKET, free=False, ceiling=PAPER_CEILING),
         Ascent("drag_free", replace(ROCKET, Cd=0.0), floor=5.0),  # else its optimum, held over steps, skims the ground
     )
 }
@@ -464,83 +465,132 @@ def ascend(case: Ascent, mesh: Mesh, guess: dict) -> dict:
 # ---------------------------------------------------------------------------------------------------------------------
 
 FIXED, CUTOFF = "RocketAscent-v0", "RocketAscentCutoff-v0"
-ROCKET_REFERENCES = {CUTOFF: "free", FIXED: "fixed_capped"}
+STORED = {CUTOFF: "free", FIXED: "fixed_capped"}  # the keys of the paper's references; any other's is its id
 RESULTS = Path(__file__).parent / "results"
 MISS_TOLERANCE = 2e-5  # terminal error of a reference in flight
-GUESSED_TIME = 900.0  # s
-PITCH_TIMES = (0.0, 30.0, 75.2, 150.4)  # s; the other five cut the last phase into quarters
+IN_PLANE = 1e-3  # rad, below which an optimum's yaw is the solver's rounding
+
+
+def mission_ascent(key: str, mission: Mission) -> Ascent:
+    """What a mission's policy is measured against: with cut-off the heaviest, else the least turning below its ceiling.
+
+    With free time no ceiling is imposed: what is left of the mass is then a bound for every flight.
+    """
+    return Ascent(key, mission.rocket, mission.cutoff, np.inf if mission.cutoff else mission.ceiling)
+
+
+def guesses(rocket: Rocket) -> list[tuple[float, float]]:
+    """Final times and times in which to tilt from straight up to the horizon, s each, in the order they are tried."""
+    end = min(900.0, 0.94 * rocket.burns[-1].end)
+    return [(end, min(280.0, 0.5 * end)), (end, 0.3 * end), (end, 0.8 * end), (0.8 * end, 0.4 * end)]
+
+
+def pitch_times(rocket: Rocket, end: float):
+    """The times (s) of `nine_pitch_angles`: the start, 30 s, every staging, quarters of the last burn until `end`.
+
+    Nine for four burns; with fewer, the longest intervals are halved until there are nine.
+    """
+    times = {0.0, 30.0, *(burn.end for burn in rocket.burns[:-1]), *np.linspace(rocket.last_ignition, end, 5)}
+    times = np.array(sorted(times))
+    while len(times) < 9:
+        longest = int(np.argmax(np.diff(times)))
+        times = np.insert(times, longest + 1, times[longest : longest + 2].mean())
+    return times
 
 
 def fly_directions(env_id: str, rocket: Rocket, u, end: float) -> dict:
     """`envs.fly_rocket` of the directions u (K, 3) in ECI, held over the steps until `end` (s)."""
-    options = {"rocket": rocket, "table_isp": rocket.table_isp}
-    return envs.fly_rocket(env_id, lambda obs, k: u[k, None], end_time=end, **options)
+    return envs.fly_rocket(env_id, lambda obs, k: u[k, None], end_time=end, rocket=rocket)
 
 
-def fly_pitch(env_id: str, pitch, end: float, **options) -> dict:
-    """`envs.fly_rocket` at the angles `pitch` (K,), rad, above the horizon, along the target's plane."""
-    act = lambda obs, k: [[np.sin(pitch[k]), np.cos(pitch[k]), 0.0]]  # noqa: E731
-    return envs.fly_rocket(env_id, act, end_time=end, action_frame="local", **options)
+def fly_angles(env_id: str, pitch, yaw, end: float, **options) -> dict:
+    """`envs.fly_rocket` at the angles `pitch` above the horizon and `yaw` out of the target's plane, (K,) rad each."""
+    ahead = np.cos(yaw)
+    u = np.stack([np.sin(pitch) * ahead, np.cos(pitch) * ahead, np.sin(yaw)], axis=1)
+    return envs.fly_rocket(env_id, lambda obs, k: u[k, None], end_time=end, action_frame="local", **options)
 
 
-def cold_start(case: Ascent, end: float) -> dict:
+def cold_start(case: Ascent, end: float, tilt_time: float) -> dict:
     """The guess: a flight that tilts evenly from straight up to the horizon and stays there."""
     t = case.rocket.dt * np.arange(np.ceil(end / case.rocket.dt))
-    pitch = np.pi / 2 * np.clip(1 - t / TILT_TIME, 0.0, 1.0)
-    flight = fly_pitch(FIXED, pitch, end, rocket=case.rocket, table_isp=case.rocket.table_isp)
+    pitch = np.pi / 2 * np.clip(1 - t / tilt_time, 0.0, 1.0)
+    flight = fly_angles(FIXED, pitch, np.zeros_like(pitch), end, rocket=case.rocket)
     return flight | {"t_u": flight["t"][:-1]}
 
 
-def collocate(case: Ascent, segments: int = SEGMENTS) -> dict:
-    """The optimum with free final time by direct collocation from a cold start: what `ascend` returns."""
-    return ascend(case, collocation_mesh(case, GUESSED_TIME, segments), cold_start(case, GUESSED_TIME))
+def optimise_ascent(case: Ascent, segments: int = SEGMENTS) -> dict:
+    """The optimum from the first of `guesses` that IPOPT takes there: what `ascend` returns.
+
+    With free final time by direct collocation, else by the environment's own steps. Raises RuntimeError that says what
+    to look at where there is none.
+    """
+    rocket = case.rocket
+    for end, tilt_time in guesses(rocket):
+        end = end if case.free else rocket.end_time
+        mesh = collocation_mesh(case, end, segments) if case.free else held_mesh(rocket, end)
+        try:
+            return ascend(case, mesh, cold_start(case, end, tilt_time))
+        except RuntimeError as error:
+            failure = error
+    launch_raan = envs.launch_raan(rocket.latitude, rocket.i)
+    plane = f"the launch site's plane at t = 0 has -arcsin(tan latitude / tan i) = {launch_raan:.4f}"
+    look = f"look at its raan, {rocket.raan} ({plane}), its payload, {rocket.payload} kg, and its i, {rocket.i}"
+    raise RuntimeError(f"{failure}, from {len(guesses(rocket))} guesses: the rocket may not reach its orbit; {look}")
 
 
 def reached_optimum(flight: dict, rocket: Rocket = ROCKET) -> dict:
-    """The optimum, as `collocate`, for the orbit that a flight reached instead of the rocket's target orbit.
+    """The optimum with free final time, as `optimise_ascent`, for the orbit that a flight reached, not the target.
 
     Of `flight` its five elements are read: `a_km e i_deg raan_deg argp_deg`. Raises RuntimeError where IPOPT finds no
     optimum.
     """
     angles = {name: float(flight[f"{name}_deg"]) for name in ("i", "raan", "argp")}
-    return collocate(Ascent("reached", replace(rocket, a=1e3 * float(flight["a_km"]), e=float(flight["e"]), **angles)))
+    with warnings.catch_warnings():  # an inclination that misses the launch latitude by a hair is no dog-leg
+        warnings.simplefilter("ignore")
+        rocket = replace(rocket, a=1e3 * float(flight["a_km"]), e=float(flight["e"]), **angles)
+        return optimise_ascent(Ascent("reached", rocket))
 
 
-def nine_pitch_angles(env_id: str, flight: dict) -> dict:
-    """The opponent: a cubic spline through a flight's pitch at nine times (`PITCH_TIMES`), flown without feedback.
+def nine_pitch_angles(env_id: str, flight: dict, rocket: Rocket) -> dict:
+    """The opponent: a cubic spline through a flight's pitch at nine times (`pitch_times`), flown without feedback.
 
-    Returns what `envs.fly_rocket` does. The times are ours: close together where the pitch turns fast.
+    Where the flight steers out of the target's plane by more than `IN_PLANE`, its yaw at these times, too. Returns what
+    `envs.fly_rocket` does. The times are ours: close together where the pitch turns fast.
     """
     from scipy.interpolate import CubicSpline
 
     t, u = flight["t"], flight["u"].T
-    up, along, _ = envs.local_frame(flight["y"][:-1].T, envs.target_axes()[2])
-    pitch, middle = np.arctan2((u * up).sum(axis=0), (u * along).sum(axis=0)), (t[:-1] + t[1:]) / 2
-    knots = np.append(PITCH_TIMES, np.linspace(ROCKET.burns[2].end, t[-1], 5))
-    return fly_pitch(env_id, CubicSpline(knots, np.interp(knots, middle, pitch))(middle), t[-1])
+    frame = envs.local_frame(flight["y"][:-1].T, envs.target_axes(rocket)[2])
+    up, along, cross = ((u * axis).sum(axis=0) for axis in frame)
+    pitch, yaw, middle = np.arctan2(up, along), np.arcsin(np.clip(cross, -1, 1)), (t[:-1] + t[1:]) / 2
+    knots = pitch_times(rocket, t[-1])
+    pitch, yaw = (CubicSpline(knots, np.interp(knots, middle, angle))(middle) for angle in (pitch, yaw))
+    if np.abs(np.arcsin(np.clip(cross, -1, 1))).max() <= IN_PLANE:
+        yaw = np.zeros_like(pitch)
+    return fly_angles(env_id, pitch, yaw, t[-1], rocket=rocket)
 
 
-def solve_ascent(key: str):
-    """One of `ASCENTS`: its numbers, its flight by the environment, and the collocation (None if the time is fixed).
+@cache
+def solve_ascent(case: Ascent):
+    """One ascent: its numbers, its flight by the environment, and the collocation (None if the time is fixed).
 
     With free final time the collocation's directions at mid-step are held over the environment's steps; with fixed time
     the program has these steps itself. Raises RuntimeError where the flight misses by more than `MISS_TOLERANCE`.
     """
     from scipy.interpolate import CubicSpline
 
-    case, begin, optimum = ASCENTS[key], time.perf_counter(), None
-    rocket = case.rocket
+    begin, rocket = time.perf_counter(), case.rocket
+    solution = optimise_ascent(case)
+    optimum = solution if case.free else None
     if case.free:
-        solution = optimum = collocate(case)
         t = np.append(rocket.dt * np.arange(np.ceil(optimum["final_time"] / rocket.dt)), optimum["final_time"])
         directions = CubicSpline(optimum["t_u"], optimum["u"])((t[:-1] + t[1:]) / 2)
     else:
-        solution = ascend(case, held_mesh(rocket, rocket.end_time), cold_start(case, rocket.end_time))
         directions = solution["u"]
     seconds = time.perf_counter() - begin
     flight = fly_directions(FIXED, rocket, directions, solution["final_time"])
     if not flight["error_norm"] <= MISS_TOLERANCE:
-        raise RuntimeError(f"rocket ascent {key}: flown by the environment it misses by {flight['error_norm']}")
+        raise RuntimeError(f"rocket ascent {case.key}: flown by the environment it misses by {flight['error_norm']}")
     numbers = {"final_mass_kg": solution["final_mass"], "final_time_s": solution["final_time"]}
     numbers |= {"error_norm": np.linalg.norm(envs.terminal_error(solution["y"][-1], rocket))}
     numbers |= {f"replay_{name}": flight[name] for name in ("error_norm", "final_mass_kg", "final_time_s")}
@@ -549,30 +599,38 @@ def solve_ascent(key: str):
     return {name: value if name == "status" else float(value) for name, value in numbers.items()}, flight, optimum
 
 
-def rocket_reference(env_id: str) -> dict:
+def rocket_reference(env_id: str, **options) -> dict:
     """The reference of an environment id, flown by it: what `envs.fly_rocket` returns, and three numbers beside it.
 
-    `reference_mass_kg` and `reference_time_s` of the solve (see `ROCKET_REFERENCES`), `nine_pitch_error_norm` of
-    `nine_pitch_angles`. Read from results/rocket_reference.{json,npz}; solved anew, with CasADi, where these cannot be
-    read or do not reach the target any more. Raises ValueError on an unknown id, RuntimeError where a solve fails.
+    `reference_mass_kg` and `reference_time_s` of the solve (see `mission_ascent`), `nine_pitch_error_norm` of
+    `nine_pitch_angles`. `options` of the environment, `rocket` and `table_isp`, change what is solved. Read from
+    results/rocket_reference.{json,npz} where it is there and still reaches the target, else solved, with CasADi.
+    Raises ValueError on an unknown id, RuntimeError where a solve fails.
     """
-    if env_id not in ROCKET_REFERENCES:
-        raise ValueError(f"env_id is {env_id!r}; it must be one of {', '.join(ROCKET_REFERENCES)}")
-    key = ROCKET_REFERENCES[env_id]
+    if env_id not in ROCKETS:
+        raise ValueError(f"env_id is {env_id!r}; it must be one of {', '.join(ROCKETS)}")
+    mission, key = envs.flown_mission(ROCKETS[env_id], **options), STORED.get(env_id, env_id)
+    rocket = mission.rocket
     try:
-        numbers = json.loads((RESULTS / "rocket_reference.json").read_text())[key]
-        mass, end_time = float(numbers["final_mass_kg"]), float(numbers["final_time_s"])
-        with np.load(RESULTS / "rocket_reference.npz") as arrays:
-            flight = fly_directions(env_id, ROCKET, arrays[f"{key}_u"], arrays[f"{key}_t"][-1])
+        numbers, u, end = stored_ascent(key)
+        flight = fly_directions(env_id, rocket, u, end)
         stale = not flight["error_norm"] <= MISS_TOLERANCE
     except (OSError, EOFError, LookupError, TypeError, ValueError, BadZipFile):
         stale = True
-    if stale:
-        numbers, flight, _ = solve_ascent(key)
-        mass, end_time = numbers["final_mass_kg"], numbers["final_time_s"]
-        flight = fly_directions(env_id, ROCKET, flight["u"], flight["t"][-1])
-    opponent = nine_pitch_angles(env_id, flight)["error_norm"]
+    if stale or mission != ROCKETS[env_id]:
+        numbers, flight, _ = solve_ascent(mission_ascent(key, mission))
+        flight = fly_directions(env_id, rocket, flight["u"], flight["t"][-1])
+    opponent = nine_pitch_angles(env_id, flight, rocket)["error_norm"]
+    mass, end_time = numbers["final_mass_kg"], numbers["final_time_s"]
     return flight | {"reference_mass_kg": mass, "reference_time_s": end_time, "nine_pitch_error_norm": opponent}
+
+
+def stored_ascent(key: str):
+    """The numbers, directions (K, 3) and final time (s) of a solve in results/; many errors where it cannot be read."""
+    numbers = json.loads((RESULTS / "rocket_reference.json").read_text())[key]
+    numbers = {name: float(numbers[name]) for name in ("final_mass_kg", "final_time_s")}
+    with np.load(RESULTS / "rocket_reference.npz") as arrays:
+        return numbers, arrays[f"{key}_u"], arrays[f"{key}_t"][-1]
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -667,26 +725,29 @@ def check_rocket(numbers: dict, optimum: dict) -> dict:
     checks = {"costate_angle_deg_max": angle.max(), "costate_angle_deg_median": np.median(angle)}
     checks["drag_free_mass_gain_kg"] = numbers["drag_free"]["final_mass_kg"] - mass
     for segments in (SEGMENTS // 2, 2 * SEGMENTS):
-        checks[f"mass_change_kg_{segments}_segments"] = collocate(ASCENTS["free"], segments)["final_mass"] - mass
+        checks[f"mass_change_kg_{segments}_segments"] = optimise_ascent(ASCENTS["free"], segments)["final_mass"] - mass
     return {key: float(value) for key, value in checks.items()}
 
 
 def report_rocket(args) -> None:
-    """Solve `ASCENTS`, print a row for each, the checks and the opponents, and write the files asked for."""
+    """Solve `ASCENTS` and the other missions', print a row for each, the checks, the opponents; write what is asked."""
     columns = ("final_mass_kg", "final_time_s", "error_norm", "replay_error_norm", "max_altitude_km", "solve_seconds")
     print(f"{'':<16}" + "".join(f"{name:>19}" for name in columns) + "  status")
     numbers, flights, optima = {}, {}, {}
-    for key in ASCENTS:
-        numbers[key], flights[key], optima[key] = solve_ascent(key)
+    others = {key: mission_ascent(key, mission) for key, mission in ROCKETS.items() if key not in STORED}
+    for key, case in (ASCENTS | others).items():
+        numbers[key], flights[key], optima[key] = solve_ascent(case)
         cells = "".join(f"{numbers[key][name]:>19.10g}" for name in columns)
         print(f"{key:<16}{cells}  {numbers[key]['status']}", flush=True)
     checks = check_rocket(numbers, optima["free"])
     for name, value in checks.items():
         print(f"{name:<32}{value:.7g}")
-    for name, env_id in (("nine_pitch_angles", CUTOFF), ("nine_pitch_angles_fixed", FIXED)):
-        opponent = nine_pitch_angles(env_id, flights[ROCKET_REFERENCES[env_id]])
+    names = {CUTOFF: "nine_pitch_angles", FIXED: "nine_pitch_angles_fixed"}
+    for env_id, mission in ROCKETS.items():
+        name = names.get(env_id, f"nine_pitch_angles_{env_id}")
+        opponent = nine_pitch_angles(env_id, flights[STORED.get(env_id, env_id)], mission.rocket)
         numbers[name] = {part: float(opponent[part]) for part in ("error_norm", "final_mass_kg", "final_time_s")}
-        print(f"{name:<32}" + "  ".join(f"{part} {value:.7g}" for part, value in numbers[name].items()))
+        print(f"{name:<40}" + "  ".join(f"{part} {value:.7g}" for part, value in numbers[name].items()))
     arrays = {f"{key}_{name}": flight[name] for key, flight in flights.items() for name in ("t", "u")}
     save(args, numbers | {"checks": checks}, arrays)
 

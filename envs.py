@@ -5,17 +5,23 @@ Importing this module registers (section "Numerical Simulations" of the paper; t
     DoubleIntegrator-v0  DoubleIntegratorWaypoints-v0  VanDerPol-v0  VanDerPolWaypoints-v0
     RocketAscent-v0  RocketAscentCutoff-v0
 
+and the rockets in the files of `vehicles/`.
+
 `gymnasium.make(id)` gives one environment, `gymnasium.make_vec(id, num_envs=N)` N of them, stepped together in float64
 NumPy with no Python loop over environments. Vehicle, equations of motion and rewards of the rocket are in `rocket.py`,
 best read before `RocketVectorEnv`; all its names are also this module's. Reading order: dynamics and tables of the
 small problems, the batch that every environment is, theirs, the single environment, the rocket's, registration.
-To add a problem of this kind: write its dynamics, its table, and one line in `PROBLEMS`.
+To add a problem of this kind: write its dynamics, its table, and one line in `PROBLEMS`. To add a rocket: a file in
+`vehicles/` that calls `register_rocket`.
 """
 
 from __future__ import annotations
 
+import importlib
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -27,17 +33,22 @@ from gymnasium.vector.utils import batch_space
 from rocket import (  # noqa: F401 - every name of rocket.py is also one of envs.py
     BOOSTER,
     G0,
+    PAPER_MISSION,
     REFERENCE_PITCH,
     ROCKET,
+    ROCKETS,
     STAGE_1,
     STAGE_2,
     TERMINAL_SCALE,
+    BadInput,
     Burn,
     Engine,
+    Mission,
     OrbitalElements,
     Rocket,
     ascent,
     guidance_reward,
+    launch_raan,
     local_frame,
     orbit_vectors,
     orbital_elements,
@@ -168,10 +179,6 @@ TRANSITION_STEPS = 5
 # ---------------------------------------------------------------------------------------------------------------------
 # Environments
 # ---------------------------------------------------------------------------------------------------------------------
-
-
-class BadInput(ValueError):
-    """A value or file that a user gave and nothing can be done with; its message is the one line that is shown."""
 
 
 class BatchedEnv(VectorEnv):
@@ -424,15 +431,15 @@ STIFF = 0.25  # drag's rate |D| / (m |v_rel|) times the step, from which a step 
 
 
 class RocketVectorEnv(BatchedEnv):
-    """N launches into a transfer orbit in four phases, steered by the thrust direction; 2 s steps, exact events.
+    """N launches of a mission's rocket into its orbit, steered by the thrust direction; 2 s steps, exact events.
 
-    Observation: [r (3) m, v (3) m/s, m kg, t_norm, phi] in ECI, t_norm = 1 - t / 961 s, phi in {0, 1/3, 2/3, 1} the
-    phase (the paper's 0 to 3, over 3) at the step's start. Action: the thrust direction, any length but 0 (BadInput),
-    normalised here; with `action_frame="local"` by (up, along-track, cross-track of the target plane) at the step's
-    start, then held in ECI. A step is one RK4 step between events: staging, a stage that runs dry (`table_isp`), the
-    end of the episode.
+    Observation: [r (3) m, v (3) m/s, m kg, t_norm, phi] in ECI, t_norm = 1 - t / end_time (961 s), phi in 0 to 1 the
+    phase at the step's start (the paper's 0 to 3, over 3; a burn is a phase). Action: the thrust direction, any length
+    but 0 (BadInput), normalised here; with `action_frame="local"` by (up, along-track, cross-track of the target plane)
+    at the step's start, then held in ECI. A step is one RK4 step between events: staging, a stage that runs dry
+    (`table_isp`), the end of the episode.
 
-    With `cutoff` (ours: the paper fixes the final time) the engine stops when, in the last phase, the specific energy
+    With a `cutoff` mission (ours: the paper fixes the final time) the engine stops when, in the last phase, the energy
     reaches the target's: the root within the step, to 1e-10, ends the episode. An altitude below 0 ends it too (crash),
     and so does `end_time`.
 
@@ -451,23 +458,23 @@ class RocketVectorEnv(BatchedEnv):
     def __init__(
         self,
         num_envs: int = 1,
-        cutoff: bool = False,
+        mission: Mission = PAPER_MISSION,
         action_frame: str = "eci",
         table_isp: bool = False,
         observe_phase: bool = True,
-        rocket: Rocket = ROCKET,
     ):
         if action_frame not in ACTION_FRAMES:
             raise ValueError(f"action_frame is {action_frame!r}; it must be one of {', '.join(ACTION_FRAMES)}")
-        self.rocket = replace(rocket, table_isp=table_isp or rocket.table_isp)
-        self._last_phase = len(rocket.burns) - 1
-        self._propellant = sum(n * engine.propellant for n, engine in rocket.burns[-1].engines)  # of the last stage
-        self.cutoff, self.action_frame, self.observe_phase = cutoff, action_frame, observe_phase
+        self.mission = flown_mission(mission, table_isp=table_isp)
+        self.rocket, self.cutoff = self.mission.rocket, mission.cutoff
+        self._last_phase = len(self.rocket.burns) - 1
+        self._propellant = sum(n * engine.propellant for n, engine in self.rocket.burns[-1].engines)  # the last stage's
+        self.action_frame, self.observe_phase = action_frame, observe_phase
         self.mass_weight, self.trajectory_weight, self.guidance_weight, self.guidance = 0.0, 0.0, 0.1, "none"
         self.terminal_scale = TERMINAL_SCALE
         x0 = self.rocket.x0
-        # |v| stays below the launcher's delta-v and 961 s of gravity, and |r| below what that speed reaches
-        high = np.array([*[4e7] * 3, *[3e4] * 3, x0[-1], 1.0, 1.0])
+        r_max, v_max = reachable(self.rocket)
+        high = np.array([*[r_max] * 3, *[v_max] * 3, x0[-1], 1.0, 1.0])
         low = np.array([*-high[:6], 0.0, 0.0, 0.0])
         spaces = Box(low, high, dtype=np.float64), Box(-1.0, 1.0, (3,), dtype=np.float64)
         super().__init__(num_envs, 1, *spaces)
@@ -507,7 +514,8 @@ class RocketVectorEnv(BatchedEnv):
         self._dropped = arcs[first, 4] * self._event  # (steps,) kg
         phase_ends = [burn.end for burn in self.rocket.burns[:-1]]
         self._phase = np.searchsorted(phase_ends, self._grid, side="right")  # (steps + 1,), 0-based
-        phase = np.append(self._phase[:-1], self._phase[-2]) / len(phase_ends)  # the last entry is seen at the end
+        phase = np.append(self._phase[:-1], self._phase[-2])  # the last entry is seen at the end
+        phase = phase / max(self._last_phase, 1)
         self._clock = np.column_stack([1 - self._grid / self.rocket.end_time, phase]) * self.observe_phase
 
     def _start(self, mask, options):
@@ -630,12 +638,13 @@ class RocketVectorEnv(BatchedEnv):
         burnt = (before[6] - self.y[6]) * (phase == self._last_phase)
         parts = np.zeros_like(self._parts)
         parts[0] = orbital_reward(self._distance, distance)
-        parts[1] = trajectory_reward(self._energy, energy, phase, self.trajectory_weight)
+        parts[1] = trajectory_reward(self._energy, energy, phase < self._last_phase, self.trajectory_weight)
         if REFERENCE_PITCH[self.guidance] is not None:
-            pitch = np.radians(np.interp(self._grid[t], *REFERENCE_PITCH[self.guidance], right=np.nan))
+            until = self.mission.guided_until or self.rocket.burns[0].end
+            pitch = np.radians(np.interp(self._grid[t] / until, *REFERENCE_PITCH[self.guidance], right=np.nan))
             parts[2] = guidance_reward(u, *local_frame(before, self._axes[2])[:2], pitch, self.guidance_weight)
         left = np.minimum(self.y[6] - self.rocket.dry_mass, self._propellant)
-        parts[3] = penalties(altitude, self.time, turn, burnt, left, self.mass_weight)
+        parts[3] = penalties(self.mission, altitude, self.time, turn, burnt, left, self.mass_weight)
         self._parts += parts
         if done.any():
             error_norm = np.linalg.norm(terminal_error(self.y[:, done].T, self.rocket), axis=1)
@@ -655,10 +664,21 @@ class RocketVectorEnv(BatchedEnv):
         return info | dict(zip(self.PARTS, self._parts.copy())) | {"episodic_return": self._parts.sum(axis=0)}
 
 
+def reachable(rocket: Rocket) -> tuple[float, float]:
+    """Bounds of |r| (m) and |v| (m/s): the launcher's delta-v and gravity all pointing one way, the whole flight."""
+    mass, delta_v = rocket.x0[-1], np.linalg.norm(rocket.x0[3:6])
+    for start, end, thrust, flow, dropped in rocket.arcs():
+        burnt = flow * (end - start)
+        delta_v += thrust / flow * np.log(mass / (mass - burnt)) if burnt else 0.0
+        mass -= burnt + dropped
+    v_max = delta_v + rocket.mu / rocket.Re**2 * rocket.end_time
+    return rocket.Re + v_max * rocket.end_time, v_max
+
+
 class RocketEnv(SingleEnv):
     """One `RocketVectorEnv`; its public attributes are the batch's."""
 
-    mass_weight = of_batch("mass_weight", "Reward lost per 100 kg of propellant burnt in the last phase.")
+    mass_weight = of_batch("mass_weight", "Reward lost per `mass_unit` of propellant burnt in the last phase.")
     trajectory_weight = of_batch("trajectory_weight", "Weight of R_trajectory.")
     guidance_weight = of_batch("guidance_weight", "Weight of R_guidance.")
     guidance = of_batch("guidance", "The reference pitch of R_guidance, a key of REFERENCE_PITCH.")
@@ -666,14 +686,20 @@ class RocketEnv(SingleEnv):
     terminal_scale = of_batch("terminal_scale", "The scale of R_terminal in the reward; reports keep TERMINAL_SCALE.")
 
 
-def make_rocket_vector(num_envs: int = 1, **options) -> RocketVectorEnv:
-    """The batched rocket; what `gymnasium.make_vec` calls."""
-    return RocketVectorEnv(num_envs, **options)
+def flown_mission(mission: Mission, rocket: Rocket | None = None, table_isp: bool = False) -> Mission:
+    """A mission as these options of the environment have it flown: by another rocket, with the table's Isp."""
+    rocket = rocket or mission.rocket
+    return replace(mission, rocket=replace(rocket, table_isp=table_isp or rocket.table_isp))
 
 
-def make_rocket(**options) -> RocketEnv:
-    """The single rocket; what `gymnasium.make` calls."""
-    return RocketEnv(make_rocket_vector(**options))
+def make_rocket_vector(env_id: str, num_envs: int = 1, rocket: Rocket | None = None, **options) -> RocketVectorEnv:
+    """The batched environment of a mission in `ROCKETS`, or of another rocket on it; `gymnasium.make_vec` calls it."""
+    return RocketVectorEnv(num_envs, flown_mission(ROCKETS[env_id], rocket), **options)
+
+
+def make_rocket(env_id: str, **options) -> RocketEnv:
+    """The single environment of a mission in `ROCKETS`; what `gymnasium.make` calls."""
+    return RocketEnv(make_rocket_vector(env_id, **options))
 
 
 def fly_rocket(env_id: str, policy: Callable, end_time: float | None = None, **options) -> dict:
@@ -707,11 +733,36 @@ for _env_id in PROBLEMS:
         vector_entry_point=f"{__name__}:make_phased_vector",
         kwargs={"env_id": _env_id},
     )
-ROCKETS = {"RocketAscent-v0": {"cutoff": False}, "RocketAscentCutoff-v0": {"cutoff": True}}
-for _env_id, _options in ROCKETS.items():
+
+
+def register_rocket(env_id: str, rocket: Rocket, cutoff: bool = False, ceiling_km: float | None = None, **rules):
+    """Make a rocket an environment id that references, evaluation, figures and `ppo_gtrxl_rocket.py` take, too.
+
+    `cutoff`, `ceiling_km` and `rules` are the fields of `Mission`. An id that is registered already is replaced. Raises
+    BadInput where the id is another environment's or cannot be one of Gymnasium's.
+    """
+    others = gym.registry.keys() - ROCKETS.keys()
+    if env_id in others or not gym.envs.registration.ENV_ID_RE.fullmatch(env_id) or "/" in env_id:
+        raise BadInput(f"env_id is {env_id!r}; it must be a new id such as MyRocket-v0")
+    ROCKETS[env_id] = Mission(rocket, cutoff, ceiling_km, **rules)
+    gym.registry.pop(env_id, None)
     gym.register(
-        id=_env_id,
+        id=env_id,
         entry_point=f"{__name__}:make_rocket",
         vector_entry_point=f"{__name__}:make_rocket_vector",
-        kwargs=_options,
+        kwargs={"env_id": env_id},
     )
+
+
+def import_vehicles():
+    """Run every file of `vehicles/`; one that cannot be is left out with a line that says why."""
+    for path in sorted(Path(__file__).parent.glob("vehicles/*.py")):
+        try:
+            importlib.import_module(f"vehicles.{path.stem}")
+        except BadInput as error:
+            print(f"vehicles/{path.name} is left out: {error}", file=sys.stderr)
+
+
+for _env_id, _cutoff in {"RocketAscent-v0": False, "RocketAscentCutoff-v0": True}.items():
+    register_rocket(_env_id, **vars(replace(PAPER_MISSION, cutoff=_cutoff)))
+import_vehicles()

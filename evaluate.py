@@ -160,13 +160,14 @@ def cost_parts(env_id: str, x: np.ndarray, u: np.ndarray) -> np.ndarray:
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def table(metrics: dict) -> str:
+def table(metrics: dict, mission: envs.Mission | None = None) -> str:
     """The table "optimum | ours | ratio" of an evaluation, to be read in a terminal.
 
     The means are over all starts. Where some miss a circle, the ratio of J is over the others and its parts have none.
+    A rocket's `mission` is its id's, unless `evaluate` was told to fly another rocket.
     """
     if metrics["env_id"] in envs.ROCKETS:
-        return rocket_table(metrics)
+        return rocket_table(metrics, mission or envs.ROCKETS[metrics["env_id"]])
     phases = envs.PROBLEMS[metrics["env_id"]].phases
     all_compared = len(phases) == 1 or metrics["hit_rate"] == metrics["reference_hit_rate"] == 1
     rows = [("", "optimum", "ours", "ratio")]
@@ -359,41 +360,55 @@ def read_csv(path) -> dict:
 SUCCESS = 0.02  # of the error's norm: ours; the paper pays for a "successful orbital insertion" and gives no bound
 ELEMENT_ERRORS = {"a_km": "a_error_km", "e": "e_error", "i_deg": "i_error_deg"}
 ELEMENT_ERRORS |= {"raan_deg": "raan_error_deg", "argp_deg": "argp_error_deg"}
-ROCKET_ROWS = (  # of the table: label, metric, digits
-    ("semi-major axis a (km)", "a_km", 3),
-    ("eccentricity e", "e", 6),
-    ("inclination i (deg)", "i_deg", 4),
-    ("right ascension of the node (deg)", "raan_deg", 4),
-    ("argument of perigee (deg)", "argp_deg", 4),
-    ("perigee altitude (km)", "perigee_km", 3),
-    ("apogee altitude (km)", "apogee_km", 3),
-    ("final mass (kg)", "final_mass_kg", 3),
-    ("  of the optimum's for the orbit reached", "mass_ratio_reached", 6),
-    ("  of the optimum's for the target orbit", "mass_ratio", 6),
-    ("final time (s)", "final_time_s", 3),
-    ("maximum altitude (km)", "max_altitude_km", 3),
-    ("lowest altitude after 300 s (km)", "min_altitude_after_300s_km", 3),
-    (f"||error|| (success: below {SUCCESS})", "error_norm", 6),
-)
+
+
+def rocket_rows(mission: envs.Mission) -> list[tuple[str, str, int]]:
+    """The rows of a rocket's table: label, metric, digits."""
+    equatorial = mission.rocket.i in EQUATORIAL
+    return [
+        ("semi-major axis a (km)", "a_km", 3),
+        ("eccentricity e", "e", 6),
+        ("inclination i (deg)", "i_deg", 4),
+        ("right ascension of the node (deg)", "raan_deg", 4),
+        ("perigee from the x axis (deg)" if equatorial else "argument of perigee (deg)", "argp_deg", 4),
+        ("perigee altitude (km)", "perigee_km", 3),
+        ("apogee altitude (km)", "apogee_km", 3),
+        ("final mass (kg)", "final_mass_kg", 3),
+        ("  of the optimum's for the orbit reached", "mass_ratio_reached", 6),
+        ("  of the optimum's for the target orbit", "mass_ratio", 6),
+        ("final time (s)", "final_time_s", 3),
+        ("maximum altitude (km)", "max_altitude_km", 3),
+        (f"lowest altitude after {mission.late:.0f} s (km)", lowest_key(mission), 3),
+        (f"||error|| (success: below {SUCCESS})", "error_norm", 6),
+    ]
+
+
+EQUATORIAL = (0.0, 180.0)  # inclinations in degrees at which an orbit has no node
 
 
 def evaluate_rocket(env_id, policy, eval_seed: int, reference: dict | None = None, **env_options):
     """`evaluate` for a rocket: `policy(obs (1, 9), t) -> action (1, 3)` flown once beside the optimum's flight.
 
-    `eval_seed` is only noted. Metrics that are not finite (the apogee of a hyperbola) are left out.
+    `eval_seed` is only noted. With the options `rocket` or `table_isp` the target and the optimum are those of that
+    rocket, too. Metrics that are not finite (the apogee of a hyperbola) or have no meaning are left out.
     """
+    changed = {name: env_options[name] for name in ("rocket", "table_isp") if name in env_options}
+    mission = envs.flown_mission(envs.ROCKETS[env_id], **changed)
+    if reference is None:
+        reference = baselines.rocket_reference(env_id, **changed) if changed else optimum(env_id, 0, 1)
     flight = envs.fly_rocket(env_id, policy, **env_options)
-    reference = optimum(env_id, 0, 1) if reference is None else reference
-    metrics = {"env_id": env_id, "eval_seed": eval_seed, "eval_starts": 1} | rocket_metrics(flight, reference)
+    metrics = {"env_id": env_id, "eval_seed": eval_seed, "eval_starts": 1} | rocket_metrics(flight, reference, mission)
     arrays = {key: flight[key] for key in ("t", "u", "y", "reward")}
     return metrics, arrays | {f"{key}_reference": reference[key] for key in ("t", "u", "y")}
 
 
-def rocket_metrics(flight: dict, reference: dict) -> dict:
+def rocket_metrics(flight: dict, reference: dict, mission: envs.Mission) -> dict:
     """The metrics of a flight of `envs.fly_rocket` beside the optimum's, `baselines.rocket_reference`."""
-    metrics, best, target = flight_summary(flight), flight_summary(reference), target_summary()
+    metrics, best = (flight_summary(flown, mission) for flown in (flight, reference))
+    target = target_summary(mission.rocket)
     for key, error in ELEMENT_ERRORS.items():
-        metrics[error] = wrapped(key, metrics[key] - target[key])
+        if key in target:
+            metrics[error] = wrapped(key, metrics[key] - target[key])
     metrics |= {f"reference_{key}": value for key, value in best.items() if not key.startswith("final_")}
     metrics |= {key: reference[key] for key in ("reference_mass_kg", "reference_time_s", "nine_pitch_error_norm")}
     metrics["mass_ratio"] = metrics["final_mass_kg"] / metrics["reference_mass_kg"]
@@ -408,40 +423,56 @@ def mass_reached(metrics: dict) -> dict:
     `mass_ratio` compares two orbits: one a little off the target can be cheaper to reach. With cut-off and success
     only, for it takes a solve of half a second and an orbit to solve for; without CasADi or a solution, no key.
     """
-    options = envs.ROCKETS.get(metrics["env_id"], {"cutoff": False})
-    if not options["cutoff"] or not metrics["success"]:
+    mission = envs.ROCKETS.get(metrics["env_id"])
+    if mission is None or not mission.cutoff or not metrics["success"]:
         return {}
     try:
-        mass = float(baselines.reached_optimum(metrics)["final_mass"])
+        mass = float(baselines.reached_optimum(metrics, mission.rocket)["final_mass"])
     except (ImportError, RuntimeError):
         return {}
     return {"mass_ratio_reached": metrics["final_mass_kg"] / mass, "reference_mass_reached_kg": mass}
 
 
-def flight_summary(flight: dict) -> dict:
+def flight_summary(flight: dict, mission: envs.Mission) -> dict:
     """What is said of ours and of the optimum alike: elements, altitudes (km above Re), mass, time, return."""
     keys = ("error_norm", *ELEMENT_ERRORS, "final_mass_kg", "final_time_s", "max_altitude_km", "episodic_return")
-    summary = {key: flight[key] for key in keys} | apsides(flight["a_km"], flight["e"])
-    late = altitude_km(flight["y"])[flight["t"] > 300.0]
-    return summary | {"min_altitude_after_300s_km": late.min(initial=np.inf)}
+    summary = {key: flight[key] for key in keys} | apsides(flight["a_km"], flight["e"], mission.rocket)
+    if mission.rocket.i in EQUATORIAL:
+        summary["argp_deg"] = perigee_longitude(summary["raan_deg"], summary["argp_deg"], mission.rocket.i)
+    late = altitude_km(flight["y"], mission.rocket)[flight["t"] > mission.late]
+    return summary | {lowest_key(mission): late.min(initial=np.inf)}
 
 
-def apsides(a_km: float, e: float) -> dict:
+def lowest_key(mission: envs.Mission) -> str:
+    """The metric of the lowest altitude after the air has been left, `min_altitude_after_300s_km` by default."""
+    return f"min_altitude_after_{mission.late:.0f}s_km"
+
+
+def perigee_longitude(raan: float, argp: float, i: float) -> float:
+    """The perigee's angle from the x axis in the direction of flight, in degrees as all, where there is no node."""
+    return (argp + (raan if i < 90 else -raan)) % 360.0
+
+
+def apsides(a_km: float, e: float, rocket: envs.Rocket) -> dict:
     """Altitudes of perigee and apogee above Re in km; a hyperbola (a < 0) has its apogee at infinity."""
-    Re = envs.ROCKET.Re / 1e3
+    Re = rocket.Re / 1e3
     return {"perigee_km": a_km * (1 - e) - Re, "apogee_km": a_km * (1 + e) - Re if a_km > 0 else np.inf}
 
 
-def altitude_km(y: np.ndarray) -> np.ndarray:
+def altitude_km(y: np.ndarray, rocket: envs.Rocket) -> np.ndarray:
     """Altitudes (K+1,) in km of states y (K+1, 7)."""
-    return (np.linalg.norm(y[:, :3], axis=1) - envs.ROCKET.Re) / 1e3
+    return (np.linalg.norm(y[:, :3], axis=1) - rocket.Re) / 1e3
 
 
-def target_summary() -> dict:
-    """The target orbit in the metrics' names and units."""
-    rocket = envs.ROCKET
-    elements = {"a_km": rocket.a / 1e3, "e": rocket.e, "i_deg": rocket.i}
-    return elements | {"raan_deg": rocket.raan, "argp_deg": rocket.argp} | apsides(rocket.a / 1e3, rocket.e)
+def target_summary(rocket: envs.Rocket) -> dict:
+    """The target orbit in the metrics' names and units, without the angles that a circle or no node leaves open."""
+    target = {"a_km": rocket.a / 1e3, "e": rocket.e, "i_deg": rocket.i, "raan_deg": rocket.raan % 360.0}
+    target["argp_deg"] = rocket.argp % 360.0
+    if rocket.i in EQUATORIAL:
+        target["argp_deg"] = perigee_longitude(target.pop("raan_deg"), rocket.argp, rocket.i)
+    if rocket.e == 0:
+        del target["argp_deg"]
+    return target | apsides(rocket.a / 1e3, rocket.e, rocket)
 
 
 def wrapped(key: str, difference: float) -> float:
@@ -449,17 +480,19 @@ def wrapped(key: str, difference: float) -> float:
     return (difference + 180.0) % 360.0 - 180.0 if key.endswith("_deg") else difference
 
 
-def rocket_table(metrics: dict) -> str:
+def rocket_table(metrics: dict, mission: envs.Mission) -> str:
     """The table "target | optimum | ours | difference" of a rocket's evaluation; "-" where there is no number."""
-    target = target_summary()
-    best = {key: metrics.get(f"reference_{key}") for _, key, _ in ROCKET_ROWS}
+    target, table_rows = target_summary(mission.rocket), rocket_rows(mission)
+    best = {key: metrics.get(f"reference_{key}") for _, key, _ in table_rows}
     best |= {"mass_ratio": 1.0, "mass_ratio_reached": 1.0}
     best |= {"final_mass_kg": metrics["reference_mass_kg"], "final_time_s": metrics["reference_time_s"]}
     rows = [("", "target", "optimum", "ours", "difference")]
-    for label, key, digits in ROCKET_ROWS:
+    for label, key, digits in table_rows:
         if key == "mass_ratio_reached" and key not in metrics:
             continue
         ours, compared = metrics.get(key), target.get(key, best[key])
+        if key in ELEMENT_ERRORS and key not in target:  # an angle that the target orbit does not have
+            ours = compared = best[key] = None
         cells = ["-" if v is None else f"{v:.{digits}f}" for v in (target.get(key), best[key], ours)]
         missing = ours is None or compared is None
         rows.append((label, *cells, "-" if missing else f"{wrapped(key, ours - compared):+.{digits}f}"))
@@ -468,14 +501,14 @@ def rocket_table(metrics: dict) -> str:
     width = max(len(row[0]) for row in rows)
     lines = [f"{metrics['env_id']}: difference from the target, or where there is none from the optimum"]
     lines += [f"  {row[0]:<{width}}" + "".join(f" {cell:>11}" for cell in row[1:]) for row in rows]
-    return "\n".join([*lines, *rocket_remarks(metrics)])
+    return "\n".join([*lines, *rocket_remarks(metrics, mission)])
 
 
-def rocket_remarks(metrics: dict) -> list[str]:
+def rocket_remarks(metrics: dict, mission: envs.Mission) -> list[str]:
     """The lines below the rocket's table: what its numbers rest on, the return and its parts, the opponent."""
     lines = []
     stopped = abs(metrics.get("a_error_km", math.inf)) < 1e-3  # a crash or an empty tank may come first
-    if envs.ROCKETS[metrics["env_id"]]["cutoff"] and stopped:
+    if mission.cutoff and stopped:
         lines.append("  With cut-off the engine stops at the target's orbital energy: a is exact because of this rule.")
     if "mass_ratio_reached" in metrics:
         mass = f"{metrics['reference_mass_reached_kg']:.3f} kg"
@@ -485,7 +518,7 @@ def rocket_remarks(metrics: dict) -> list[str]:
     parts = ", ".join(f"{part} {metrics[part]:.3f}" for part in envs.RocketVectorEnv.PARTS)
     lines.append(f"    of it: {parts}")
     opponent = f"||error|| {metrics['nine_pitch_error_norm']:.6f}"
-    return [*lines, f"  Opponent, open loop: the optimum's pitch at nine times, interpolated: {opponent}"]
+    return [*lines, f"  Opponent, open loop: the optimum's pitch (and yaw) at nine times, interpolated: {opponent}"]
 
 
 def rocket_seed_lines(runs: list[dict]) -> list[str]:

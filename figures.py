@@ -6,7 +6,6 @@ Reading order: what every problem shows, double integrator and Van der Pol, rock
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -249,7 +248,6 @@ def draw_cost_error(arrays: dict, metrics: dict) -> Figure:
 # Rocket ascent
 # ---------------------------------------------------------------------------------------------------------------------
 
-ALTITUDE_LIMIT = 250.0  # km, beyond which the paper penalises an overshoot
 DASHED = {"linewidth": 1.4, "linestyle": (0, (6, 5))}  # one line a panel: gaps that show the other line beneath
 OURS, BEST = {**POLICY, "linewidth": 2.2}, {**OPTIMUM, **DASHED}
 # velocities share a panel with positions: the same widths and dashes, paler
@@ -275,6 +273,7 @@ def scale_rocket_panel(ax, tag: str, values: np.ndarray):
 
 def draw_ascent(arrays: dict, metrics: dict) -> Figure:
     """The paper's six panels (mass, altitude, speed, components), the thrust direction below them, pitch and yaw."""
+    mission = envs.ROCKETS[metrics["env_id"]]
     figure = Figure(figsize=(15, 13), layout="constrained")
     rows = [["mass", "altitude", "speed"], ["x", "y", "z"], ["ux", "uy", "uz"]]
     mosaic = [[name for name in row for _ in range(2)] for row in rows] + [["pitch"] * 3 + ["yaw"] * 3]
@@ -283,26 +282,27 @@ def draw_ascent(arrays: dict, metrics: dict) -> Figure:
     for (side, style), pale in zip(FLIGHTS.items(), VELOCITY):
         t, u, y = (arrays[f"{key}{side}"] for key in ("t", "u", "y"))
         panels["mass"].plot(t, y[:, 6] / 1e3, **style)
-        panels["altitude"].plot(t, altitude_km(y), **style)
+        panels["altitude"].plot(t, altitude_km(y, mission.rocket), **style)
         panels["speed"].plot(t, np.linalg.norm(y[:, 3:6], axis=1) / 1e3, **style)
         for k, axis in enumerate("xyz"):
             panels[axis].plot(t, y[:, k] / 1e3, **style)
             velocity[k].plot(t, y[:, 3 + k] / 1e3, **pale)
             panels[f"u{axis}"].stairs(u[:, k], t, baseline=None, **{**style, "linewidth": style["linewidth"] / 1.5})
-        for name, angle in zip(("pitch", "yaw"), pitch_and_yaw(u, y)):
+        for name, angle in zip(("pitch", "yaw"), pitch_and_yaw(u, y, mission.rocket)):
             panels[name].stairs(angle, t, baseline=None, **style)
-    panels["altitude"].axhline(ALTITUDE_LIMIT, **{**TARGET, "linestyle": "--"})
-    label_ascent(panels, velocity)
+    label_ascent(panels, velocity, mission.rocket)
     figure.suptitle(rocket_headline(metrics))
     lines = [(OURS, "policy"), (BEST, "optimum"), (VELOCITY[0], "velocity, policy")]
-    lines += [(VELOCITY[1], "velocity, optimum"), ({**TARGET, "linestyle": "--"}, f"{ALTITUDE_LIMIT:.0f} km")]
-    lines += [(BOUNDARY, "end of a phase")]
+    lines += [(VELOCITY[1], "velocity, optimum"), (BOUNDARY, "end of a phase")]
+    if mission.ceiling_km is not None:
+        panels["altitude"].axhline(mission.ceiling_km, **{**TARGET, "linestyle": "--"})
+        lines += [({**TARGET, "linestyle": "--"}, f"{mission.ceiling_km:.0f} km")]
     handles = [Line2D([], [], **style, label=label) for style, label in lines]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
     return figure
 
 
-def label_ascent(panels: dict, velocity: list):
+def label_ascent(panels: dict, velocity: list, rocket: envs.Rocket):
     """Axes' labels, the phases' ends, and what is dropped at each of them."""
     labels = {"mass": "(a) mass (t)", "altitude": "(b) altitude (km)", "speed": "(c) inertial speed (km/s)"}
     labels |= {axis: f"({letter}) position ${axis}$ (km)" for letter, axis in zip("def", "xyz")}
@@ -311,53 +311,69 @@ def label_ascent(panels: dict, velocity: list):
     for name, ax in panels.items():
         ax.set(xlabel="time (s)", ylabel=labels[name], ylim=(-1.1, 1.1) if name[0] == "u" else None)
         ax.grid(alpha=0.3)
-        for burn in envs.ROCKET.burns[:-1]:
+        for burn in rocket.burns[:-1]:
             ax.axvline(burn.end, **BOUNDARY)
     low, high = panels["yaw"].get_ylim()
     panels["yaw"].set_ylim(min(low, -5), max(high, 5))  # a flight in the plane would show rounding errors only
     for axis, ax in zip("xyz", velocity):
         ax.set_ylabel(f"velocity $v_{axis}$ (km/s), pale", color="0.4")
         ax.tick_params(axis="y", colors="0.4")
-    for burn, height in zip(envs.ROCKET.burns, (0.9, 0.75, 0.6)):  # of the axes; the last burn drops nothing
-        text = f" {burn.end} s: {burn.jettison / 1e3:.2f} t dropped"
+    for k, burn in enumerate(rocket.burns[:-1]):  # the last burn drops nothing
+        text, height = f" {burn.end:g} s: {burn.jettison / 1e3:.2f} t dropped", 0.9 - 0.15 * (k % 5)  # of the axes
         panels["mass"].text(burn.end, height, text, transform=panels["mass"].get_xaxis_transform(), fontsize=9)
 
 
-def pitch_and_yaw(u: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def pitch_and_yaw(u: np.ndarray, y: np.ndarray, rocket: envs.Rocket) -> tuple[np.ndarray, np.ndarray]:
     """Pitch above the local horizon and yaw from the target plane, (K,) each in degrees, of u (K, 3) at y (K+1, 7).
 
     Yaw is NaN within six degrees of the vertical: its direction there is noise.
     """
-    up, along, cross = np.einsum("cdk,kd->ck", envs.local_frame(y[: len(u)].T, envs.target_axes()[2]), u)
+    up, along, cross = np.einsum("cdk,kd->ck", envs.local_frame(y[: len(u)].T, envs.target_axes(rocket)[2]), u)
     yaw = np.where(np.hypot(along, cross) > 0.1, np.degrees(np.arctan2(cross, along)), np.nan)
     return np.degrees(np.arcsin(np.clip(up, -1, 1))), yaw
 
 
-def orbit_points(rocket: envs.Rocket) -> np.ndarray:
-    """Points (n, 3) in km, ECI, of the orbit with this rocket's target elements; NaN where a hyperbola has none."""
-    anomaly = np.radians(np.linspace(-180, 180, 3601))
-    slowness = 1 + rocket.e * np.cos(anomaly)
-    r = rocket.a / 1e3 * (1 - rocket.e**2) / np.where(slowness > 1e-3, slowness, np.nan)
-    perigee, semi_latus, _ = envs.target_axes(rocket)
-    return r[:, None] * (np.cos(anomaly)[:, None] * perigee + np.sin(anomaly)[:, None] * semi_latus)
+def target_points(rocket: envs.Rocket) -> np.ndarray:
+    """Points (n, 3) in km, ECI, of the target orbit."""
+    return orbit_points(*envs.target_orbit(rocket.target, rocket.mu), rocket)
+
+
+def reached_points(y: np.ndarray, rocket: envs.Rocket) -> np.ndarray:
+    """Points (n, 3) in km, ECI, of the orbit that a flight y (K+1, 7) ended in."""
+    return orbit_points(*(np.array(vector) for vector in envs.orbit_vectors(y[-1], rocket.mu)), rocket)
+
+
+def orbit_points(h: np.ndarray, e: np.ndarray, rocket: envs.Rocket) -> np.ndarray:
+    """Points (n, 3) in km, ECI, of the orbit with this angular momentum and eccentricity vector, (3,) each.
+
+    r = p / (1 + e . d) in every direction d of its plane, p = |h|^2 / mu; NaN where a hyperbola has none.
+    """
+    normal = h / np.linalg.norm(h)
+    along = np.cross(normal, envs.target_axes(rocket)[0])  # any direction of the plane will do to count from
+    ahead = along / np.linalg.norm(along)
+    angle = np.radians(np.linspace(-180, 180, 3601))[:, None]
+    directions = np.cos(angle) * np.cross(ahead, normal) + np.sin(angle) * ahead
+    slowness = 1 + directions @ e
+    r = (h @ h) / rocket.mu / 1e3 / np.where(slowness > 1e-3, slowness, np.nan)
+    return r[:, None] * directions
 
 
 def draw_orbit(arrays: dict, metrics: dict) -> Figure:
     """Ascent, target orbit and the orbit reached in the target's plane; the insertion enlarged; the ground track."""
     figure = Figure(figsize=(13, 11), layout="constrained")
     panels = figure.subplot_mosaic([["plane", "insertion"], ["ground", "ground"]], height_ratios=[3, 2])
-    reached = {key: metrics[f"{key}_deg"] for key in ("i", "raan", "argp")}
-    reached = replace(envs.ROCKET, a=1e3 * metrics["a_km"], e=metrics["e"], **reached)
+    mission = envs.ROCKETS[metrics["env_id"]]
+    reached = reached_points(arrays["y"], mission.rocket)
     lines = {
-        "target orbit": (orbit_points(envs.ROCKET), {**TARGET, "linewidth": 4.0, "alpha": 0.4}),
+        "target orbit": (target_points(mission.rocket), {**TARGET, "linewidth": 4.0, "alpha": 0.4}),
         "policy": (arrays["y"][:, :3] / 1e3, OURS),
-        "orbit reached": (orbit_points(reached), {**OURS, "linewidth": 1.0, "linestyle": ":"}),
+        "orbit reached": (reached, {**OURS, "linewidth": 1.0, "linestyle": ":"}),
         "optimum": (arrays["y_reference"][:, :3] / 1e3, BEST),
     }
-    draw_target_plane(panels["plane"], panels["insertion"], lines)
-    top = 1.15 * max(ALTITUDE_LIMIT, metrics["max_altitude_km"], metrics["reference_max_altitude_km"])
+    draw_target_plane(panels["plane"], panels["insertion"], lines, mission.rocket)
+    top = 1.15 * max(mission.ceiling_km or 0.0, metrics["max_altitude_km"], metrics["reference_max_altitude_km"])
     panels["insertion"].set(ylim=(-0.03 * top, top))
-    draw_ground_track(panels["ground"], arrays)
+    draw_ground_track(panels["ground"], arrays, mission.rocket)
     for ax in figure.axes:
         ax.grid(alpha=0.3)
     figure.suptitle(rocket_headline(metrics))
@@ -365,15 +381,19 @@ def draw_orbit(arrays: dict, metrics: dict) -> Figure:
     return figure
 
 
-def draw_target_plane(plane, insertion, lines: dict):
+def draw_target_plane(plane, insertion, lines: dict, rocket: envs.Rocket):
     """The target's plane, perigee to the right, to scale; and in it altitude over angle, from launch to insertion.
 
     `lines`: label -> (points (n, 3) in km, ECI; style). The second panel cuts the first along the horizon.
     """
-    axes, Re, ends = envs.target_axes(), envs.ROCKET.Re / 1e3, []
+    axes, Re, ends = envs.target_axes(rocket), rocket.Re / 1e3, []
+    launch = axes @ lines["policy"][0][0]
+    middle = np.degrees(np.arctan2(launch[1], launch[0])) + 90  # no ascent goes further round the Earth than half
     for label, (r, style) in lines.items():
         x, y, _ = axes @ r.T
-        angle, altitude = np.degrees(np.arctan2(y, x)), np.linalg.norm(r, axis=1) - Re
+        angle, altitude = (np.degrees(np.arctan2(y, x)) - middle + 180) % 360 - 180, np.linalg.norm(r, axis=1) - Re
+        altitude[1:][np.abs(np.diff(angle)) > 180] = np.nan  # no line from one edge to the other
+        angle = angle + middle
         plane.plot(x / 1e3, y / 1e3, label=label, **style)
         insertion.plot(angle, altitude, **style)
         if label in ("policy", "optimum"):
@@ -381,19 +401,20 @@ def draw_target_plane(plane, insertion, lines: dict):
             ends += [angle[0], angle[-1]]
     plane.add_patch(Circle((0, 0), Re / 1e3, color="0.85", zorder=0))
     plane.text(0, 0, "Earth", ha="center", va="center")
-    apogee = envs.ROCKET.a / 1e6 * (1 + envs.ROCKET.e)
-    plane.set(xlim=(-1.06 * apogee, 0.25 * apogee), ylim=(-0.65 * apogee, 0.65 * apogee), aspect="equal")
+    a, b = rocket.a / 1e6, rocket.a / 1e6 * np.sqrt(1 - rocket.e**2)  # half axes
+    left, right = max(a * (1 + rocket.e), Re / 1e3), max(a * (1 - rocket.e), Re / 1e3)
+    margin, half = 0.06 * left, 1.1 * max(b, Re / 1e3)
+    plane.set(xlim=(-left - margin, right + margin), ylim=(-half, half), aspect="equal")
     plane.set(xlabel="towards the target's perigee (1000 km)", ylabel="along its semi-latus rectum (1000 km)")
     plane.set_title("Plane of the target orbit")
     insertion.set(xlabel="angle from the target's perigee (deg)", ylabel="altitude (km)")
     insertion.set(xlim=(min(ends) - 2, max(ends) + 8), title="Ascent and insertion (circles)")
 
 
-def draw_ground_track(ax, arrays: dict):
+def draw_ground_track(ax, arrays: dict, rocket: envs.Rocket):
     """Longitude (the launch site's is 0) and geocentric latitude of both flights, over the turning Earth."""
-    rocket = envs.ROCKET
     along = np.radians(np.linspace(-90, 90, 361))[:, None]  # either side of the perigee
-    perigee, semi_latus, _ = envs.target_axes()
+    perigee, semi_latus, _ = envs.target_axes(rocket)
     circle = np.cos(along) * perigee + np.sin(along) * semi_latus
     tracks = [(circle, 0.0, {**TARGET, "alpha": 0.4}, "target plane at launch")]
     tracks += [(circle, arrays["t"][-1], {**TARGET, "alpha": 0.4, "linestyle": ":"}, "target plane at the end")]

@@ -22,7 +22,7 @@ from torch.distributions import Normal
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 import runs
-from envs import ROCKET, TERMINAL_SCALE, target_axes, target_orbit
+from envs import ROCKETS, TERMINAL_SCALE, target_axes, target_orbit
 from runs import total
 
 
@@ -54,7 +54,7 @@ class Args:
     observe_phase: bool = True  # show time and phase to the policy
     action_frame: str = "local"  # the thrust direction's axes: local (up, along-track, cross-track) or eci
     guidance: str = "none"  # early reference pitch of R_guidance: none (R_guidance is 0), linear or knots
-    mass_weight: float = 1.0  # cut-off: reward lost for 100 kg burnt in the last phase, from 60 % of the updates on
+    mass_weight: float = 1.0  # cut-off: reward lost for each 1.5 % of the dry mass (100 kg) burnt in the last phase
     reward_scale: float = 0.2  # factor on the rewards in training; everything logged is unscaled
 
     # transformer (a laptop's; README has Table 1's beside ours)
@@ -94,18 +94,25 @@ class Args:
 
 
 # Problem: what differs from the other scripts -------------------------------------------------------------------------
-ENV_IDS = ("RocketAscent-v0", "RocketAscentCutoff-v0")
+ENV_IDS = tuple(ROCKETS)
 ENV_OPTIONS = ("observe_phase", "action_frame")  # arguments of the environments
-AXES = target_axes()  # rows: directions of perigee and semi-latus rectum, plane normal
-H_TARGET, E_TARGET = target_orbit()  # angular momentum and eccentricity vector
-LENGTH, SPEED = ROCKET.Re, (ROCKET.mu / ROCKET.Re) ** 0.5  # units in which mu = 1: 6378 km and 7.9 km/s
-CONSTANTS = {
-    "axes": AXES.tolist(),
-    "units": [LENGTH] * 3 + [SPEED] * 3 + [ROCKET.dry_mass],
-    "h_target": (AXES @ H_TARGET / (LENGTH * SPEED)).tolist(),
-    "e_target": (AXES @ E_TARGET).tolist(),
-}
-BUFFERS = dict.fromkeys(ENV_IDS, CONSTANTS)  # what `features` reads as agent.<name>; saved with the weights
+
+
+def constants(rocket):
+    """What `features` reads as agent.<name> for a rocket; saved with the weights."""
+    axes = target_axes(rocket)  # rows: directions of perigee and semi-latus rectum, plane normal
+    h_target, e_target = target_orbit(rocket.target, rocket.mu)  # angular momentum and eccentricity vector
+    length, speed = rocket.Re, (rocket.mu / rocket.Re) ** 0.5  # units in which mu = 1: 6378 km and 7.9 km/s
+    return {
+        "axes": axes.tolist(),
+        "units": [length] * 3 + [speed] * 3 + [rocket.dry_mass],
+        "h_target": (axes @ h_target / (length * speed)).tolist(),
+        "e_target": (axes @ e_target).tolist(),
+        "phases": np.linspace(0.0, 1.0, len(rocket.burns)).tolist(),
+    }
+
+
+BUFFERS = {env_id: constants(mission.rocket) for env_id, mission in ROCKETS.items()}
 INITIAL_ACTION = [1.0, 0.0, 0.0]  # straight up: a randomly steered rocket never leaves the ground
 
 
@@ -116,7 +123,7 @@ def features(agent, obs):
     that small ones are seen. Frame, scales and tanh are ours: the paper gives the state alone.
     """
     r, v, mass = (obs[..., :7] / agent.units).split([3, 3, 1], dim=-1)
-    t_norm, phase = obs[..., 7:8], obs[..., 8:9]  # phase: 0 to 1, the paper's 0 to 3
+    t_norm, phase = obs[..., 7:8], obs[..., 8:9]  # phase: 0 to 1, one of agent.phases (the paper's 0 to 3)
     r = r @ agent.axes.T  # towards the perigee, along the semi-latus rectum, normal to the plane
     v = v @ agent.axes.T
     radius = r.norm(dim=-1, keepdim=True)
@@ -127,8 +134,7 @@ def features(agent, obs):
     radial_velocity = 8 * ((r * v).sum(dim=-1, keepdim=True) / radius)  # 8: the unit of speed in km/s
     out_of_plane = [64 * r[..., 2:], 8 * v[..., 2:]]
     speed = v.norm(dim=-1, keepdim=True)
-    last_phase = len(ROCKET.burns) - 1
-    phases = ((last_phase * phase).round() == torch.arange(last_phase + 1, device=obs.device)).to(obs.dtype)  # one-hot
+    phases = ((phase - agent.phases).abs() < 1e-3).to(obs.dtype)  # one-hot
     state = [r, v, altitude, radial_velocity, *out_of_plane, speed, t_norm, mass.log(), phases]
     return torch.cat([*state, error, (10 * error).tanh()], dim=-1)
 

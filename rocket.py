@@ -1,17 +1,38 @@
-"""The rocket without any environment: vehicle, Earth and target orbit, equations of motion, orbits, rewards.
+"""Rockets without any environment: vehicle, Earth and target orbit, equations of motion, orbits, rewards.
 
-Reading order: the tables (`Engine`, `Burn`, `Rocket`; `ROCKET` is the paper's), the equations of motion (`ascent`), the
-geometry of orbits, the five parts of the reward. Functions of a state without memory; nothing is imported but NumPy,
-and `ascent`, `orbit_vectors` and `specific_energy` take CasADi symbols, too. `RocketVectorEnv` in `envs.py` flies it:
-time grid, events, RK4, cutoff. Every name here is also one of `envs`.
+Reading order: the tables (`Engine`, `Burn`, `Rocket`; `ROCKET` is the paper's), what cannot fly, the missions, the
+equations of motion (`ascent`), the geometry of orbits, the five parts of the reward. Functions of a state without
+memory; nothing is imported but NumPy, and `ascent`, `orbit_vectors` and `specific_energy` take CasADi symbols, too.
+`RocketVectorEnv` in `envs.py` flies them: time grid, events, RK4, cutoff. Every name here is also one of `envs`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import warnings
+from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import numpy as np
+
+
+class BadInput(ValueError):
+    """A value or file that a user gave and nothing can be done with; its message is the one line that is shown."""
+
+
+def refuse_unless(possible, field: str, value, allowed: str):
+    """BadInput with one line that names the field, the value and what is allowed."""
+    if not possible:
+        raise BadInput(f"{field} is {value}; it {allowed}")
+
+
+def refuse_unless_finite(whose: str, table):
+    """BadInput for the first number of a dataclass that is not one, or is infinite."""
+    for field in fields(table):
+        value = getattr(table, field.name)
+        if field.type == "float":
+            number = isinstance(value, int | float | np.number) and np.isfinite(value)
+            refuse_unless(number, f"{whose} {field.name}", value, "must be a finite number")
+
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Vehicle, Earth and target (the paper's table "Vehicle Properties and Simulation Parameters", and where it rounds or
@@ -28,6 +49,14 @@ class Engine:
     thrust: float  # N
     isp: float  # s, the table's, which its propellant, thrust and burn time contradict (stage 2: 467.2 s)
     burn_time: float  # s
+
+    def __post_init__(self):
+        refuse_unless_finite("an engine's", self)
+        for name in ("total_mass", "burn_time", "isp"):
+            refuse_unless(getattr(self, name) > 0, f"an engine's {name}", getattr(self, name), "must be positive")
+        allowed = f"must be between 0 and its total_mass, {self.total_mass} kg"
+        refuse_unless(0 <= self.propellant <= self.total_mass, "an engine's propellant", self.propellant, allowed)
+        refuse_unless(self.thrust >= 0, "an engine's thrust", self.thrust, "must not be negative")
 
     def flow(self, table_isp: bool) -> float:
         """Propellant flow in kg/s: propellant / burn time (the GPOPS-II benchmark's), or T / (g0 Isp) of the table."""
@@ -75,7 +104,10 @@ STAGE_2 = Engine(total_mass=19300.0, propellant=16820.0, thrust=110094.0, isp=46
 
 @dataclass(frozen=True)
 class Rocket:
-    """The paper's rocket, Earth and target. A vehicle of your own is `dataclasses.replace(ROCKET, ...)`."""
+    """The paper's rocket, Earth and target by default; a vehicle of your own is `Rocket(burns=..., payload=..., ...)`.
+
+    Raises BadInput, which names the field, where it cannot fly: see `check_rocket`.
+    """
 
     burns: tuple[Burn, ...] = (
         Burn(75.2, ((6, BOOSTER), (1, STAGE_1)), dropped=((6, BOOSTER),)),
@@ -100,6 +132,14 @@ class Rocket:
     dt: float = 2.0  # s
     end_time: float = 961.0  # s
     table_isp: bool = False
+
+    def __post_init__(self):
+        check_rocket(self)
+
+    @property
+    def last_ignition(self) -> float:
+        """s: when the last burn begins."""
+        return self.burns[-2].end if len(self.burns) > 1 else 0.0
 
     @property
     def x0(self) -> np.ndarray:
@@ -144,7 +184,105 @@ class Rocket:
         return arcs
 
 
+# ---------------------------------------------------------------------------------------------------------------------
+# What cannot fly is refused where it is made
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def check_rocket(rocket: Rocket):
+    """BadInput where a rocket cannot be; a warning where it can, at a price that is easily overlooked."""
+    refuse_unless_finite("a rocket's", rocket)
+    for name in ("mu", "Re", "H", "dt", "a", "end_time"):
+        refuse_unless(getattr(rocket, name) > 0, f"a rocket's {name}", getattr(rocket, name), "must be positive")
+    for name in ("payload", "rho0", "Cd", "S"):
+        refuse_unless(getattr(rocket, name) >= 0, f"a rocket's {name}", getattr(rocket, name), "must not be negative")
+    refuse_unless(0 <= rocket.e < 1, "a rocket's e", rocket.e, "must be at least 0 and below 1, a closed orbit")
+    refuse_unless(0 <= rocket.i <= 180, "a rocket's i", rocket.i, "must be between 0 and 180 degrees")
+    refuse_unless(-90 < rocket.latitude < 90, "a rocket's latitude", rocket.latitude, "must be between -90 and 90")
+    check_burns(rocket)
+    last = rocket.burns[-1].end
+    allowed = f"must be at most the last burn's end, {last}"
+    refuse_unless(rocket.end_time <= last, "a rocket's end_time", rocket.end_time, allowed)
+    thrust, weight = rocket.burns[0].thrust, rocket.x0[6] * rocket.mu / rocket.Re**2
+    allowed = f"must be above the weight at lift-off, {weight:.6g} N"
+    refuse_unless(thrust > weight, "the thrust of burns[0]", f"{thrust:.6g} N", allowed)
+    if min(rocket.i, 180 - rocket.i) < abs(rocket.latitude):
+        needs = f"below the launch latitude {rocket.latitude}: the plane can only be reached by a dog-leg"
+        warnings.warn(f"a rocket's i is {rocket.i} degrees, {needs}", stacklevel=4)
+
+
+def check_burns(rocket: Rocket):
+    """BadInput where the burns are not in order, burn what is not aboard, or longer than their propellant lasts."""
+    refuse_unless(rocket.burns, "a rocket's burns", rocket.burns, "must hold at least one burn")
+    start, used = 0.0, {}
+    for k, burn in enumerate(rocket.burns):
+        refuse_unless(
+            start < burn.end < np.inf, f"burns[{k}].end", burn.end, f"must be finite and later than {start} s"
+        )
+        refuse_unless(burn.engines, f"burns[{k}].engines", burn.engines, "must hold an engine")
+        aboard = engines_aboard(rocket, k)
+        for number, engine in burn.engines:
+            field, has = f"the number of an engine in burns[{k}].engines", aboard.get(engine, 0)
+            allowed = f"must be positive and at most {has}: so many are dropped then or later, or are of the last burn"
+            refuse_unless(0 < number <= has, field, number, allowed)
+            used[engine] = used.get(engine, 0.0) + number * engine.flow(rocket.table_isp) * (burn.end - start)
+        start = burn.end
+    first = engines_aboard(rocket, 0)
+    runs_dry = [engine for _, engine in rocket.burns[-1].engines] if rocket.table_isp else []
+    for k, burn in enumerate(rocket.burns):
+        for _, engine in burn.engines:
+            has = first[engine] * engine.propellant
+            covered = engine in runs_dry or used[engine] <= has * (1 + 1e-9)
+            field = f"the propellant of burns[{k}].engines, {engine.propellant} kg each,"
+            refuse_unless(covered, field, f"{has:.6g} kg in all", f"must cover their burns, {used[engine]:.6g} kg")
+
+
+def engines_aboard(rocket: Rocket, k: int) -> dict:
+    """How many of each engine fly in burn k: those dropped at its end or later, and the last burn's."""
+    aboard = {}
+    for number, engine in [*(part for burn in rocket.burns[k:] for part in burn.dropped), *rocket.burns[-1].engines]:
+        aboard[engine] = aboard.get(engine, 0) + number
+    return aboard
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Missions: a vehicle and the rules that it flies by. `ROCKETS` is what environments, references, evaluation, figures
+# and the script read; `envs.register_rocket` adds to it
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Mission:
+    """A registered rocket."""
+
+    rocket: Rocket
+    cutoff: bool = False  # the engine stops at the target's energy; without it at end_time
+    ceiling_km: float | None = None  # altitude beyond which an overshoot is penalised, and the reference's bound
+    floor_km: float = 110.0  # altitude below which a dip is penalised once the air has been left
+    late: float = 300.0  # s after which it has
+    guided_until: float | None = None  # s until which R_guidance has a reference pitch (none: the first burn's end)
+    mass_unit: float | None = None  # kg whose burning --mass-weight prices (none: 1.5 % of the dry mass)
+
+    @property
+    def ceiling(self) -> float:
+        """m; infinite where there is none."""
+        return np.inf if self.ceiling_km is None else 1e3 * self.ceiling_km
+
+
 ROCKET = Rocket()
+# the paper penalises an overshoot beyond 250 km; until 150.4 s the boosters burn
+PAPER_MISSION = Mission(ROCKET, ceiling_km=250.0, guided_until=ROCKET.burns[1].end, mass_unit=100.0)
+ROCKETS: dict[str, Mission] = {}  # by environment id
+
+
+def launch_raan(latitude: float, i: float) -> float:
+    """The node's right ascension (degrees, 0 to 360) of the plane of inclination i that holds the launch site at t = 0.
+
+    The site's longitude is 0 (ours), so that RAAN = -arcsin(tan latitude / tan i), for a launch towards the north. A
+    target in another plane costs propellant: 1 degree at 7.7 km/s about 130 m/s times sin i.
+    """
+    return float(np.degrees(-np.arcsin(np.clip(np.tan(np.radians(latitude)) / np.tan(np.radians(i)), -1, 1))) % 360)
+
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Equations of motion: x is a tuple of components, each a NumPy array over environments or a CasADi symbol
@@ -227,8 +365,11 @@ def target_orbit(elements: OrbitalElements = ROCKET.target, mu: float = ROCKET.m
 
 
 def target_axes(rocket: Rocket = ROCKET) -> np.ndarray:
-    """Rows: perigee direction, semi-latus direction, plane normal of the target orbit, (3, 3), unit vectors in ECI."""
-    h, e = target_orbit(rocket.target, rocket.mu)
+    """Rows: perigee direction, semi-latus direction, plane normal of the target orbit, (3, 3), unit vectors in ECI.
+
+    A circle has no perigee: its axes are those of an ellipse with the same angles.
+    """
+    h, e = target_orbit(rocket.target._replace(e=rocket.e or 0.5), rocket.mu)
     normal, perigee = h / np.linalg.norm(h), e / np.linalg.norm(e)
     return np.array([perigee, np.cross(normal, perigee), normal])
 
@@ -273,15 +414,15 @@ def orbital_reward(distance, next_distance):
     return 10.0 * (distance - next_distance)
 
 
-def trajectory_reward(energy, next_energy, phase, weight):
-    """R_trajectory = w (E_{t+1} - E_t) / (1 MJ/kg) in phases 0 to 2 of 0 to 3, E the specific energy; by default 0."""
-    return weight * (next_energy - energy) / 1e6 * (phase < 3)
+def trajectory_reward(energy, next_energy, early, weight):
+    """R_trajectory = w (E_{t+1} - E_t) / (1 MJ/kg) where `early`, before the last burn; E the specific energy."""
+    return weight * (next_energy - energy) / 1e6 * early
 
 
-REFERENCE_PITCH = {  # degrees above the horizon over time (s), until the second boosters are dropped; our own guess
+REFERENCE_PITCH = {  # degrees above the horizon over time, as a part of a mission's `guided_until`; our own guess
     "none": None,
-    "linear": ((0.0, 150.4), (90.0, 40.0)),
-    "knots": ((0.0, 10.0, 40.0, 75.2, 150.4), (90.0, 88.0, 72.0, 55.0, 35.0)),
+    "linear": ((0.0, 1.0), (90.0, 40.0)),
+    "knots": ((0.0, 0.0665, 0.266, 0.5, 1.0), (90.0, 88.0, 72.0, 55.0, 35.0)),
 }
 
 
@@ -294,20 +435,23 @@ def guidance_reward(u, up, along, pitch, weight):
     return np.where(np.isnan(pitch), 0.0, -weight * (1 - cosine))
 
 
-def penalties(altitude, time, turn, burnt, left, mass_weight):
-    """R_penalties = -40 c - 0.024 o - 0.024 s - 0.001 |u_t - u_{t-1}| - w_m (b + c l) / 100 kg.
+def penalties(mission: Mission, altitude, time, turn, burnt, left, mass_weight):
+    """R_penalties = -40 c - 0.024 o - 0.024 s - 0.001 |u_t - u_{t-1}| - w_m (b + c l) / mass_unit.
 
-    c = 1[h < 0], a crash, which must cost more than the worst miss; o = clip((h - 245 km) / 100 km, 0, 1), overshoot;
-    s = clip((110 km - h) / 30 km, 0, 1) after 300 s, a dip into the air at orbital speed; b (kg), the propellant that a
-    step of the last phase burns, l, what a crash leaves of it. Altitude h (m), time (s): the step's end's.
+    c = 1[h < 0], a crash, which must cost more than the worst miss; o = clip((h + 5 km - ceiling) / 100 km, 0, 1),
+    overshoot; s = clip((floor - h) / 30 km, 0, 1) late in the flight, a dip into the air at orbital speed; b (kg), the
+    propellant that a step of the last phase burns, l, what a crash leaves of it. Altitude h (m), time (s): the step's
+    end's. Ceiling, floor (110 km), what is late (after 300 s) and mass_unit (the paper's rocket: 100 kg) are the
+    mission's.
 
-    The paper names h > 0, overshoot beyond 250 km and |u_t - u_{t-1}|; the sizes, the margin that lets o begin at
-    245 km, the dip below 110 km and the price of propellant are ours.
+    The paper names h > 0, overshoot beyond 250 km and |u_t - u_{t-1}|; the sizes, the margin that lets o begin 5 km
+    below the ceiling, the dip and the price of propellant are ours.
     """
     crash = altitude < 0
-    overshoot = np.minimum(np.maximum((altitude - 245e3) / 100e3, 0.0), 1.0)
-    sag = np.minimum(np.maximum((110e3 - altitude) / 30e3, 0.0), 1.0) * (time > 300.0)
-    return -40.0 * crash - 0.024 * (overshoot + sag) - 0.001 * turn - mass_weight * (burnt + crash * left) / 100.0
+    overshoot = np.minimum(np.maximum((altitude - (mission.ceiling - 5e3)) / 100e3, 0.0), 1.0)
+    sag = np.minimum(np.maximum((1e3 * mission.floor_km - altitude) / 30e3, 0.0), 1.0) * (time > mission.late)
+    mass_unit = mission.mass_unit or 0.015 * mission.rocket.dry_mass
+    return -40.0 * crash - 0.024 * (overshoot + sag) - 0.001 * turn - mass_weight * (burnt + crash * left) / mass_unit
 
 
 TERMINAL_SCALE = 0.005  # of the reported R_terminal
