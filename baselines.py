@@ -288,6 +288,7 @@ def waypoint_reference(env_id: str, x0, processes: int | None = None) -> dict:
 # ---------------------------------------------------------------------------------------------------------------------
 
 SEGMENTS = 80
+MAX_ITERATIONS = 150  # an ascent that exists took 18 to 42; one that does not would take IPOPT's 3000
 GAUSS_POINTS = (1 + np.polynomial.legendre.leggauss(4)[0]) / 2  # in (0, 1)
 
 
@@ -438,7 +439,8 @@ def ascend(case: Ascent, mesh: Mesh, guess: dict) -> dict:
     rocket, n, points = case.rocket, len(mesh.t) - 1, mesh.points
     program, scale = ascent_program(case, mesh), state_scale(rocket)
     options = {"print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.tol": 1e-10}
-    solve = ca.nlpsol("ascent", "ipopt", program, options | {"ipopt.bound_relax_factor": 0})
+    options |= {"ipopt.bound_relax_factor": 0, "ipopt.max_iter": MAX_ITERATIONS}
+    solve = ca.nlpsol("ascent", "ipopt", program, options)
     times = np.append(mesh.t[1:], mesh.t_u if points else [])  # of x and z
     states = interpolate(times, guess["t"], guess["y"][:, :6]) / scale
     start = np.concatenate([states.ravel(), interpolate(mesh.t_u, guess["t_u"], guess["u"]).ravel(), mesh.t[-1:]])
@@ -467,7 +469,8 @@ def ascend(case: Ascent, mesh: Mesh, guess: dict) -> dict:
 FIXED, CUTOFF = "RocketAscent-v0", "RocketAscentCutoff-v0"
 STORED = {CUTOFF: "free", FIXED: "fixed_capped"}  # the keys of the paper's references; any other's is its id
 RESULTS = Path(__file__).parent / "results"
-MISS_TOLERANCE = 2e-5  # terminal error of a reference in flight
+STORED_MISS = 2e-5  # terminal error of a stored reference in flight, from which it is of another rocket
+MISS_TOLERANCE = 5e-4  # the same of a solved one: what holding its directions over steps may cost a quick vehicle
 IN_PLANE = 1e-3  # rad, below which an optimum's yaw is the solver's rounding
 
 
@@ -482,7 +485,7 @@ def mission_ascent(key: str, mission: Mission) -> Ascent:
 def guesses(rocket: Rocket) -> list[tuple[float, float]]:
     """Final times and times in which to tilt from straight up to the horizon, s each, in the order they are tried."""
     end = min(900.0, 0.94 * rocket.burns[-1].end)
-    return [(end, min(280.0, 0.5 * end)), (end, 0.3 * end), (end, 0.8 * end), (0.8 * end, 0.4 * end)]
+    return [(end, min(280.0, 0.5 * end)), (end, 0.8 * end), (0.8 * end, 0.3 * end)]
 
 
 def pitch_times(rocket: Rocket, end: float):
@@ -518,6 +521,16 @@ def cold_start(case: Ascent, end: float, tilt_time: float) -> dict:
     return flight | {"t_u": flight["t"][:-1]}
 
 
+def refuse_too_weak(case: Ascent):
+    """RuntimeError where all the delta-v at once, on the ground and eastwards, has not the target's energy."""
+    rocket = case.rocket
+    speed = envs.delta_v(rocket) + np.linalg.norm(rocket.x0[3:6])
+    if speed**2 / 2 - rocket.mu / rocket.Re < rocket.target_energy:
+        needs = np.sqrt(2 * (rocket.target_energy + rocket.mu / rocket.Re))
+        has = f"delta-v and the Earth's turning are {speed:.0f} m/s, its orbit needs {needs:.0f} m/s and losses"
+        raise RuntimeError(f"rocket ascent {case.key}: {has}; look at its payload, {rocket.payload} kg")
+
+
 def optimise_ascent(case: Ascent, segments: int = SEGMENTS) -> dict:
     """The optimum from the first of `guesses` that IPOPT takes there: what `ascend` returns.
 
@@ -525,6 +538,7 @@ def optimise_ascent(case: Ascent, segments: int = SEGMENTS) -> dict:
     to look at where there is none.
     """
     rocket = case.rocket
+    refuse_too_weak(case)
     for end, tilt_time in guesses(rocket):
         end = end if case.free else rocket.end_time
         mesh = collocation_mesh(case, end, segments) if case.free else held_mesh(rocket, end)
@@ -614,7 +628,7 @@ def rocket_reference(env_id: str, **options) -> dict:
     try:
         numbers, u, end = stored_ascent(key)
         flight = fly_directions(env_id, rocket, u, end)
-        stale = not flight["error_norm"] <= MISS_TOLERANCE
+        stale = not flight["error_norm"] <= max(STORED_MISS, 1.01 * numbers["replay_error_norm"])
     except (OSError, EOFError, LookupError, TypeError, ValueError, BadZipFile):
         stale = True
     if stale or mission != ROCKETS[env_id]:
@@ -628,7 +642,7 @@ def rocket_reference(env_id: str, **options) -> dict:
 def stored_ascent(key: str):
     """The numbers, directions (K, 3) and final time (s) of a solve in results/; many errors where it cannot be read."""
     numbers = json.loads((RESULTS / "rocket_reference.json").read_text())[key]
-    numbers = {name: float(numbers[name]) for name in ("final_mass_kg", "final_time_s")}
+    numbers = {name: float(numbers[name]) for name in ("final_mass_kg", "final_time_s", "replay_error_norm")}
     with np.load(RESULTS / "rocket_reference.npz") as arrays:
         return numbers, arrays[f"{key}_u"], arrays[f"{key}_t"][-1]
 

@@ -47,6 +47,7 @@ from rocket import (  # noqa: F401 - every name of rocket.py is also one of envs
     OrbitalElements,
     Rocket,
     ascent,
+    delta_v,
     guidance_reward,
     launch_raan,
     local_frame,
@@ -666,12 +667,7 @@ class RocketVectorEnv(BatchedEnv):
 
 def reachable(rocket: Rocket) -> tuple[float, float]:
     """Bounds of |r| (m) and |v| (m/s): the launcher's delta-v and gravity all pointing one way, the whole flight."""
-    mass, delta_v = rocket.x0[-1], np.linalg.norm(rocket.x0[3:6])
-    for start, end, thrust, flow, dropped in rocket.arcs():
-        burnt = flow * (end - start)
-        delta_v += thrust / flow * np.log(mass / (mass - burnt)) if burnt else 0.0
-        mass -= burnt + dropped
-    v_max = delta_v + rocket.mu / rocket.Re**2 * rocket.end_time
+    v_max = np.linalg.norm(rocket.x0[3:6]) + delta_v(rocket) + rocket.mu / rocket.Re**2 * rocket.end_time
     return rocket.Re + v_max * rocket.end_time, v_max
 
 

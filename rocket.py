@@ -275,6 +275,16 @@ PAPER_MISSION = Mission(ROCKET, ceiling_km=250.0, guided_until=ROCKET.burns[1].e
 ROCKETS: dict[str, Mission] = {}  # by environment id
 
 
+def delta_v(rocket: Rocket) -> float:
+    """m/s that all burns together give a rocket without gravity and drag: the sum of T / flow ln(m / (m - burnt))."""
+    mass, sum_of_arcs = rocket.x0[-1], 0.0
+    for start, end, thrust, flow, dropped in rocket.arcs():
+        burnt = flow * (end - start)
+        sum_of_arcs += thrust / flow * np.log(mass / (mass - burnt)) if burnt else 0.0
+        mass -= burnt + dropped
+    return float(sum_of_arcs)
+
+
 def launch_raan(latitude: float, i: float) -> float:
     """The node's right ascension (degrees, 0 to 360) of the plane of inclination i that holds the launch site at t = 0.
 
