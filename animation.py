@@ -69,12 +69,13 @@ class Flight(NamedTuple):
 
 
 class Sheet:
-    """A figure of WIDTH x HEIGHT pixels that is drawn again and again."""
+    """A figure of WIDTH x HEIGHT pixels that is drawn again and again; `moving` are the artists that change."""
 
     def __init__(self, title: str):
         self.figure = Figure(figsize=(WIDTH / DPI, HEIGHT / DPI), dpi=DPI)
         self.canvas = FigureCanvasAgg(self.figure)
         self.figure.text(0.5, 0.955, title, ha="center", fontsize=10)
+        self.moving, self._limits, self._still = [], None, None
 
     def panel(self, box, title: str = "", **labels):
         """Axes at `box` (left, bottom, width, height as shares of the sheet), small text, a pale grid."""
@@ -89,7 +90,15 @@ class Sheet:
 
     def pixels(self) -> np.ndarray:
         """The sheet as it is now: uint8, (HEIGHT, WIDTH, 3)."""
-        self.canvas.draw()
+        limits = [(ax.get_xlim(), ax.get_ylim()) for ax in self.figure.axes]
+        if limits != self._limits:  # ticks and text cost most of a drawing: what stands still is drawn once
+            for artist in self.moving:
+                artist.set_animated(True)
+            self.canvas.draw()
+            self._limits, self._still = limits, self.canvas.copy_from_bbox(self.figure.bbox)
+        self.canvas.restore_region(self._still)
+        for artist in sorted(self.moving, key=lambda artist: artist.zorder):
+            self.figure.draw_artist(artist)
         return np.asarray(self.canvas.buffer_rgba())[..., :3].copy()
 
 
@@ -128,6 +137,7 @@ class PhasePlane(Sheet):
         style = {"transform": self.plane.transAxes, "va": "top", "fontsize": 9, "weight": "bold", "zorder": 8}
         self.clock = self.plane.text(0.02, 0.98, "", **style)
         self._add_legend()
+        self.moving = [*sum(self.lines, []), *self.heads, *self.circles, self.starts, self.clock]
 
     def _lines(self, ax, style: dict) -> LineCollection:
         look = {"colors": style["color"], "linewidths": style["linewidth"] * 0.8, "linestyles": [style["linestyle"]]}
@@ -229,6 +239,8 @@ class Ascent(Sheet):
         self._prepare_lines()
         self._prepare_events()
         self._prepare_readings()
+        self.moving = [*self.paths, *self.pitches, *self.orbits, *self.dots, self.flame, self.body, self.marks]
+        self.moving += [*self.labels, self.clock, *self.readings]
 
     def _draw_orbit_panel(self):
         """The target's plane to scale, perigee to the right: Earth and the target orbit."""
