@@ -182,20 +182,37 @@ TRANSITION_STEPS = 5
 # ---------------------------------------------------------------------------------------------------------------------
 
 
+DRAWN = {"render_modes": ["rgb_array"], "render_fps": 15}
+
+
 class BatchedEnv(VectorEnv):
     """What every problem shares: step counters, checks of the action, and autoreset in the same step.
 
     A problem gives the spaces, `episode_steps` (the longest episode) and three methods:
     `_start(mask, options)` puts the environments in `mask` at a start, `_observe()` returns (N, obs) float64, and
     `_advance(actions)` flies one step and returns `(rewards (N,), terminated (N,), final)`, where `final()` gives the
-    `final_info` arrays of the finished episodes; it is only called when there is one.
+    `final_info` arrays of the finished episodes; it is only called when there is one. One that can be drawn has
+    `DRAWN` in its `metadata` and two more: `_snapshot()` returns time (N,) s, the control of the step before (N, m) and
+    state (N, n), arrays of their own, and `_make_sheet(animation)` the drawing.
     """
 
     metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
 
-    def __init__(self, num_envs: int, episode_steps: int, single_observation_space: Box, single_action_space: Box):
+    def __init__(
+        self,
+        num_envs: int,
+        episode_steps: int,
+        single_observation_space: Box,
+        single_action_space: Box,
+        render_mode: str | None = None,
+    ):
         if num_envs < 1:
             raise ValueError(f"num_envs is {num_envs}; it must be at least 1")
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            allowed = ", ".join(["None", *self.metadata["render_modes"]])
+            raise ValueError(f"render_mode is {render_mode!r}; it must be one of {allowed}")
+        self.render_mode, self._sheet = render_mode, None
+        self._trails = [[] for _ in range(num_envs)]  # of each running episode, only where it is rendered
         self.num_envs, self.episode_steps = num_envs, episode_steps
         self.single_observation_space = single_observation_space
         self.single_action_space = single_action_space
@@ -233,11 +250,48 @@ class BatchedEnv(VectorEnv):
             bad = int(np.flatnonzero(~np.isfinite(actions).all(axis=1))[0])
             raise BadInput(f"action of env {bad} at step {self.t[bad]} is {actions[bad].tolist()}; it must be finite")
         rewards, terminated, final = self._advance(actions)
+        if self.render_mode is not None:
+            self._record(np.ones(self.num_envs, dtype=bool))
         return self._observe(), rewards, terminated, final() if terminated.any() else {}
+
+    def render(self):
+        """The running episodes so far, a tuple of N frames, uint8 (H, W, 3); without a render mode a warning and None.
+
+        An episode that has just ended is the next one already, as autoreset in the same step has it.
+        """
+        if self.render_mode is None:
+            warn_of_no_mode(self)
+            return None
+        if not self._trails[0]:
+            raise ResetNeeded("nothing to render: call reset() first")
+        import animation  # Matplotlib takes a quarter of a second that only a drawing should cost
+
+        self._sheet = self._sheet or self._make_sheet(animation)
+        columns = [[np.array(column) for column in zip(*trail)] for trail in self._trails]
+        return tuple(self._sheet.frame(animation.Flight(t, u[1:], y)) for t, u, y in columns)
 
     def _restart(self, mask, options):
         self.t[mask] = 0
         self._start(mask, options or {})
+        if self.render_mode is not None:
+            for k in np.flatnonzero(mask):
+                self._trails[k] = []
+            self._record(mask)
+
+    def _record(self, mask):
+        """Add time, control of the step before, and state to the trails of the environments in `mask`."""
+        time, control, state = self._snapshot()
+        for k in np.flatnonzero(mask):
+            self._trails[k].append((time[k], control[k], state[k]))
+
+
+def warn_of_no_mode(env):
+    """Gymnasium's usual warning where `render` is called without a render mode."""
+    env_id = env.spec.id if env.spec else "id"
+    gym.logger.warn(
+        "You are calling render method without specifying any render mode. You can specify the render_mode at "
+        f'initialization, e.g. gym.make("{env_id}", render_mode="rgb_array")'
+    )
 
 
 class PhasedVectorEnv(BatchedEnv):
@@ -260,7 +314,9 @@ class PhasedVectorEnv(BatchedEnv):
     smaller where G does not divide N).
     """
 
-    def __init__(self, problem: Problem, num_envs: int = 1, observe_phase: bool = True):
+    metadata = {**BatchedEnv.metadata, **DRAWN}
+
+    def __init__(self, problem: Problem, num_envs: int = 1, observe_phase: bool = True, render_mode: str | None = None):
         self.problem, self.observe_phase = problem, observe_phase
         self.radius_scale, self.flights_per_start = 1.0, 1
         multi_phase = len(problem.phases) > 1
@@ -270,9 +326,10 @@ class PhasedVectorEnv(BatchedEnv):
         low[-2 if multi_phase else -1 :] = 0.0
         u_max = np.array([problem.u_max])
         spaces = Box(low, high, dtype=np.float64), Box(-u_max, u_max, dtype=np.float64)
-        super().__init__(num_envs, problem.steps, *spaces)
+        super().__init__(num_envs, problem.steps, *spaces, render_mode)
         self._tabulate()
         self.x = (np.zeros(num_envs), np.zeros(num_envs))
+        self.u = np.zeros(num_envs)  # the control of the step before, as applied
         self._running_cost = np.zeros((2, num_envs))  # state and control part of the running episode's cost
         self._terminal_cost = np.zeros(num_envs)
         self._bonus = np.zeros(num_envs)
@@ -323,7 +380,7 @@ class PhasedVectorEnv(BatchedEnv):
         rewards = -cost.sum(axis=0)
         self.x = rk4(self.problem.f, self.x, u, self.problem.dt)
         ends = self._phase_ends[t]
-        self.t = t + 1
+        self.u, self.t = u, t + 1
         if ends.any():
             rewards += self._end_phase(np.flatnonzero(ends))
         return rewards, self.t == self.problem.steps, self._final_info
@@ -350,6 +407,12 @@ class PhasedVectorEnv(BatchedEnv):
         hit = error <= [phase.radius for phase in self.problem.phases]
         return {"episodic_return": self._bonus - cost, "cost": cost, **parts, "hit": hit, "terminal_error": error}
 
+    def _snapshot(self):
+        return self.t * self.problem.dt, self.u[:, None], np.column_stack(self.x)
+
+    def _make_sheet(self, animation):
+        return animation.PhasePlane(self.problem)
+
 
 class SingleEnv(gym.Env):
     """One environment: a thin view of a batch of one (`batch`), without its autoreset.
@@ -357,10 +420,9 @@ class SingleEnv(gym.Env):
     A step without a reset before it, also the one after an episode's end, raises `gymnasium.error.ResetNeeded`.
     """
 
-    metadata = {"render_modes": []}
-
     def __init__(self, batch: BatchedEnv):
-        self.batch = batch
+        self.batch, self.render_mode = batch, batch.render_mode
+        self.metadata = {key: value for key, value in batch.metadata.items() if key != "autoreset_mode"}
         self._running = False  # from a reset to the end of its episode
         self.observation_space, self.action_space = batch.single_observation_space, batch.single_action_space
 
@@ -381,6 +443,13 @@ class SingleEnv(gym.Env):
         obs, rewards, terminated, final = self.batch.advance(np.asarray(action)[None])
         self._running = not terminated[0]
         return obs[0], float(rewards[0]), bool(terminated[0]), False, {key: value[0] for key, value in final.items()}
+
+    def render(self):
+        """The episode so far, uint8 (H, W, 3); without a render mode a warning and None."""
+        if self.render_mode is None:
+            warn_of_no_mode(self)
+            return None
+        return self.batch.render()[0]
 
 
 def of_batch(name: str, doc: str) -> property:
@@ -454,6 +523,7 @@ class RocketVectorEnv(BatchedEnv):
     `terminal_scale`, a curriculum: the *reward* pays R_terminal with it, `final_info` reports it with `TERMINAL_SCALE`.
     """
 
+    metadata = {**BatchedEnv.metadata, **DRAWN}
     PARTS = ("R_orbital", "R_trajectory", "R_guidance", "R_penalties", "R_terminal")
 
     def __init__(
@@ -463,6 +533,7 @@ class RocketVectorEnv(BatchedEnv):
         action_frame: str = "eci",
         table_isp: bool = False,
         observe_phase: bool = True,
+        render_mode: str | None = None,
     ):
         if action_frame not in ACTION_FRAMES:
             raise ValueError(f"action_frame is {action_frame!r}; it must be one of {', '.join(ACTION_FRAMES)}")
@@ -478,7 +549,7 @@ class RocketVectorEnv(BatchedEnv):
         high = np.array([*[r_max] * 3, *[v_max] * 3, x0[-1], 1.0, 1.0])
         low = np.array([*-high[:6], 0.0, 0.0, 0.0])
         spaces = Box(low, high, dtype=np.float64), Box(-1.0, 1.0, (3,), dtype=np.float64)
-        super().__init__(num_envs, 1, *spaces)
+        super().__init__(num_envs, 1, *spaces, render_mode)
         self.end_time = self.rocket.end_time  # sets episode_steps, too
         self._axes = target_axes(self.rocket)
         h, e = target_orbit(self.rocket.target, self.rocket.mu)
@@ -664,6 +735,12 @@ class RocketVectorEnv(BatchedEnv):
         info |= {"max_altitude_km": self._max_altitude / 1e3, "points": precision_points(error_norm)}
         return info | dict(zip(self.PARTS, self._parts.copy())) | {"episodic_return": self._parts.sum(axis=0)}
 
+    def _snapshot(self):
+        return self.time.copy(), self.u.T.copy(), self.y.T.copy()
+
+    def _make_sheet(self, animation):
+        return animation.Ascent(self.rocket)
+
 
 def reachable(rocket: Rocket) -> tuple[float, float]:
     """Bounds of |r| (m) and |v| (m/s): the launcher's delta-v and gravity all pointing one way, the whole flight."""
@@ -721,6 +798,8 @@ def fly_rocket(env_id: str, policy: Callable, end_time: float | None = None, **o
 # ---------------------------------------------------------------------------------------------------------------------
 # Registration (no max_episode_steps: the horizon is the problem's own, and its end, by our reading, a true one)
 # ---------------------------------------------------------------------------------------------------------------------
+
+make_phased.metadata = make_rocket.metadata = DRAWN  # where gym.make looks before there is an environment
 
 for _env_id in PROBLEMS:
     gym.register(

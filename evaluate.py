@@ -2,10 +2,11 @@
 
     python evaluate.py publish RUN_DIR results/di     # add a run to a results folder (--ship: make it the shipped one)
     python evaluate.py figures results/di             # redraw its figures and print its table (a run folder works too)
+    python evaluate.py animate results/di             # and its figures/animation.gif
 
 Reading order: cases and ratios, table, files, training curves, rocket ascent (its metrics and table), results folders,
-command line. The figures are in `figures.py`, which is imported only where something is drawn. The names of all metrics
-(`eval.json`) and arrays (`eval.npz`) are the interface of the project. Costs are the paper's J: plain sums, no unit.
+command line. The figures are in `figures.py` and `animation.py`, imported only where something is drawn. The names of
+all metrics (`eval.json`) and arrays (`eval.npz`) are the interface of the project. Costs are the paper's J: plain sums.
 """
 
 from __future__ import annotations
@@ -567,6 +568,7 @@ def publish(run_dir, folder, ship: bool = False):
         for name in ("agent.safetensors", "eval.npz", "eval.json"):
             write_bytes(folder / name, (run_dir / name).read_bytes())
         redraw(folder)
+        animate(folder)
 
 
 def redraw(folder) -> list[Path]:
@@ -578,6 +580,15 @@ def redraw(folder) -> list[Path]:
     curves = {path.stem: read_csv(path) for path in sorted((folder / "seeds").glob("*.csv"))}
     curve = curves.pop(str(metrics["seed"]), None) or read_curve(folder) or None
     return figures.draw(folder / "figures", arrays, metrics, curve, list(curves.values()))
+
+
+def animate(folder) -> Path:
+    """Write figures/animation.gif of a results or run folder from its eval.json and eval.npz; returns its path."""
+    import animation
+
+    folder = Path(folder)
+    metrics, arrays = read_evaluation(folder)
+    return animation.write(folder / "figures", arrays, metrics)
 
 
 def seed_lines(folder) -> list[str]:
@@ -602,7 +613,7 @@ def seed_lines(folder) -> list[str]:
 
 
 def main():
-    """`python evaluate.py publish RUN_DIR FOLDER [--ship]` and `python evaluate.py figures FOLDER`."""
+    """`python evaluate.py publish RUN_DIR FOLDER [--ship]`, `... figures FOLDER` and `... animate FOLDER`."""
     parser = argparse.ArgumentParser(description="Results folders: add a run, redraw figures, print the table.")
     commands = parser.add_subparsers(dest="command", required=True)
     command = commands.add_parser("publish", help="add a run to a results folder")
@@ -611,8 +622,13 @@ def main():
     command.add_argument("--ship", action="store_true", help="replace the policy that the folder ships")
     command = commands.add_parser("figures", help="redraw the figures of a results or run folder, print its table")
     command.add_argument("folder", type=Path, help="results/<name> or runs/...")
+    command = commands.add_parser("animate", help="write figures/animation.gif of a results or run folder")
+    command.add_argument("folder", type=Path, help="results/<name> or runs/...")
     args = parser.parse_args()
     try:
+        if args.command == "animate":
+            print(animate(args.folder))
+            return
         if args.command == "publish":
             publish(args.run_dir, args.folder, args.ship)
         else:

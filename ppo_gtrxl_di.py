@@ -37,7 +37,7 @@ class Args:
     track: bool = False  # if toggled, this experiment will be tracked with Weights and Biases
     wandb_project_name: str = "ppo-gtrxl"  # the wandb's project name
     wandb_entity: str | None = None  # the entity (team) of wandb's project
-    capture_video: bool = False  # draw the figures of the final evaluation into the run's folder
+    capture_video: bool = False  # draw the final evaluation into the run's folder: animation.gif and the figures
     save_model: bool = True  # write checkpoints and the evaluation (off: TensorBoard events only)
     checkpoint: str | None = None  # start from these weights (.safetensors)
     resume: str | None = None  # run folder of an interrupted run to go on with, bit for bit

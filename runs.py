@@ -380,9 +380,11 @@ class Run:
             paths = (self.folder / name for name in ("agent.safetensors", "eval.json", "eval.npz"))
             evaluate.write(metrics, arrays, *paths)
         if args.capture_video:
+            import animation
             import figures
 
             figures.draw(self.folder / "figures", arrays, metrics, evaluate.read_curve(self.folder))
+            animation.write(self.folder / "figures", arrays, metrics)
         print(evaluate.table(metrics))
         print(f"run folder: {self.folder}")
 

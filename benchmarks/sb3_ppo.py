@@ -19,49 +19,14 @@ import gymnasium as gym
 import numpy as np
 import torch
 from stable_baselines3 import PPO
-from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
+from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import envs  # noqa: E402
 import evaluate  # noqa: E402
+from sb3_env import NativeVecEnv  # noqa: E402
 
 PARTS = 10  # evaluated after each tenth of the samples
-
-
-class NativeVecEnv(VecEnv):
-    """A native batched environment in Stable-Baselines3's own vector interface."""
-
-    def __init__(self, batch: envs.BatchedEnv):
-        self.batch = batch
-        super().__init__(batch.num_envs, batch.single_observation_space, batch.single_action_space)
-
-    def reset(self):
-        return self.batch.reset(seed=self._seeds[0])[0].astype(np.float32)
-
-    def step_async(self, actions):
-        self.actions = actions
-
-    def step_wait(self):
-        obs, rewards, terminated, _, info = self.batch.step(self.actions)
-        infos = [{} for _ in range(self.num_envs)]
-        for k in np.flatnonzero(terminated):
-            infos[k] = {"terminal_observation": info["final_obs"][k].astype(np.float32), "TimeLimit.truncated": False}
-        return obs.astype(np.float32), rewards, terminated, infos
-
-    def close(self):
-        pass
-
-    def get_attr(self, name, indices=None):
-        return [getattr(self.batch, name, None)] * self.num_envs
-
-    def set_attr(self, name, value, indices=None):
-        setattr(self.batch, name, value)
-
-    def env_method(self, name, *args, indices=None, **kwargs):
-        return [getattr(self.batch, name)(*args, **kwargs)] * self.num_envs
-
-    def env_is_wrapped(self, wrapper_class, indices=None):
-        return [False] * self.num_envs
 
 
 def main():

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import animation
 import envs
 import evaluate
 import figures
@@ -291,10 +292,12 @@ def test_missing_reference_is_solved_and_options_reach_the_environment(monkeypat
     assert set(seen) == {0.0}
 
 
-@pytest.mark.parametrize("module", ["envs", "baselines", "evaluate", "figures"])
+@pytest.mark.parametrize("module", ["envs", "baselines", "evaluate", "figures", "animation"])
 def test_import_loads_nothing_heavy(module):
     """A training and `--help` wait for none of these; a figure needs Matplotlib, but no window."""
-    heavy = {"torch", "casadi", "scipy", "matplotlib.pyplot"} | ({"matplotlib"} if module != "figures" else set())
+    heavy = {"torch", "casadi", "scipy", "matplotlib.pyplot"} | (
+        {"matplotlib"} if module not in ("figures", "animation") else set()
+    )
     code = f"import {module}, sys; print(*{heavy} & sys.modules.keys())"
     result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert result.stdout.strip() == ""
@@ -468,10 +471,12 @@ def test_median_curve_ends_with_the_shortest_seed():
 def test_publish_ships_the_first_seed_and_adds_the_second(tmp_path, monkeypatch, capsys):
     first, second = make_run(tmp_path / "a", seed=1), make_run(tmp_path / "b", seed=2, level=-1.0)
     results = tmp_path / "results" / "di"
+    monkeypatch.setattr(animation, "FRAMES", 3)
     printed = command_line(monkeypatch, capsys, "publish", first, results)
     assert "ratio" in printed and SINGLE in printed
     names = {"agent.safetensors", "eval.json", "eval.npz", "seeds/1.json", "seeds/1.csv"}
     names |= {f"figures/{name}.png" for name in ("training", "trajectories", "costs", "cost_error")}
+    names.add("figures/animation.gif")
     files = snapshot(results)
     assert {str(name) for name in files} == names
     for name in ("agent.safetensors", "eval.json", "eval.npz"):
@@ -495,9 +500,10 @@ def test_publish_ships_the_first_seed_and_adds_the_second(tmp_path, monkeypatch,
     assert (results / "agent.safetensors").read_bytes() == b"weights of seed 1"
 
     redrawn = []
-    monkeypatch.setattr(evaluate, "redraw", redrawn.append)
+    for name in ("redraw", "animate"):  # neither a figure nor an animation of the policy before it stays
+        monkeypatch.setattr(evaluate, name, redrawn.append)
     command_line(monkeypatch, capsys, "publish", second, results, "--ship")
-    assert redrawn == [results]
+    assert redrawn == [results, results]
     assert (results / "agent.safetensors").read_bytes() == b"weights of seed 2"
     assert json.loads((results / "eval.json").read_text())["seed"] == 2
 
@@ -547,7 +553,8 @@ FAULTS = {
 def test_refused_publishing_leaves_the_folder_untouched(tmp_path, monkeypatch, capsys):
     results = tmp_path / "results"
     good = make_run(tmp_path / "good", seed=1)
-    monkeypatch.setattr(evaluate, "redraw", lambda folder: [])  # drawing is tested above
+    for name in ("redraw", "animate"):  # drawing is tested above
+        monkeypatch.setattr(evaluate, name, lambda folder: [])
     command_line(monkeypatch, capsys, "publish", good, results)
     before = snapshot(results)
     for fault, message in FAULTS.items():

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from test_evaluate import command_line, snapshot
 
+import animation
 import envs
 import evaluate
 import figures
@@ -533,11 +534,12 @@ def test_publish_and_figures(flown, tmp_path, monkeypatch, capsys):
     first = make_run(tmp_path / "a", flown[CUTOFF])
     second = make_run(tmp_path / "b", flown[CUTOFF], seed=2, error_norm=0.5, final_mass_kg=6000.0, mass_ratio=0.8)
     results = tmp_path / "results" / "rocket_cutoff"
+    monkeypatch.setattr(animation, "FRAMES", 3)
     printed = command_line(monkeypatch, capsys, "publish", first, results)
     assert printed.startswith(CUTOFF) and "eccentricity" in printed and "seed 1" not in printed
     files = snapshot(results)
     names = {"agent.safetensors", "eval.json", "eval.npz", "seeds/1.json", "seeds/1.csv"}
-    names |= {f"figures/{name}.png" for name in ("training", "trajectory", "orbit")}
+    names |= {f"figures/{name}.png" for name in ("training", "trajectory", "orbit")} | {"figures/animation.gif"}
     assert {str(name) for name in files} == names
     for name, content in files.items():
         if name.suffix == ".png":
@@ -553,7 +555,8 @@ def test_publish_and_figures(flown, tmp_path, monkeypatch, capsys):
 
 
 def test_refused_publishing(flown, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(evaluate, "redraw", lambda folder: [])
+    for name in ("redraw", "animate"):
+        monkeypatch.setattr(evaluate, name, lambda folder: [])
     results = tmp_path / "results"
     command_line(monkeypatch, capsys, "publish", make_run(tmp_path / "good", flown[CUTOFF]), results)
     before = snapshot(results)

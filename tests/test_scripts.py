@@ -24,6 +24,7 @@ import safetensors.torch
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+import animation
 import runs
 
 torch.set_num_threads(1)
@@ -107,13 +108,14 @@ def imported(nodes):
     return {name.split(".")[0] for name in names}
 
 
-ROOMS = ["rocket", "envs", "baselines", "evaluate", "figures", "runs"]  # each imports only those before it
+ROOMS = ["rocket", "envs", "baselines", "evaluate", "figures", "animation", "runs"]  # each imports only those before it
 
 
 def test_imports_point_one_way():
-    """scripts -> runs -> figures -> evaluate -> baselines -> envs -> rocket; a script is imported by nothing.
+    """scripts -> runs -> animation -> figures -> evaluate -> baselines -> envs -> rocket; nothing imports a script.
 
-    Figures are imported where something is drawn: by evaluate's command line, too, and at no module's top.
+    Figures and animation are imported where something is drawn: by evaluate's command line and an environment's
+    `render`, too, and, but for the one by the other, at no module's top.
     """
     rank = {name: k for k, name in enumerate(ROOMS)} | {path.stem: len(ROOMS) for path in SCRIPTS}
     for path in ROOT.rglob("*.py"):
@@ -121,14 +123,15 @@ def test_imports_point_one_way():
             continue
         tree = ast.parse(path.read_text())
         top, anywhere = imported(tree.body) & rank.keys(), imported(ast.walk(tree)) & rank.keys()
-        lazily = {"figures"} if path.stem == "evaluate" else set()
+        lazily = {"evaluate": {"figures", "animation"}, "envs": {"animation"}}.get(path.stem, set())
         own = min(rank.get(path.stem, len(ROOMS)), len(ROOMS))
         assert all(rank[name] < own for name in anywhere - lazily), (path, anywhere)
-        assert "figures" not in top, path
+        assert "animation" not in top and ("figures" not in top or path.stem == "animation"), path
 
 
 LIGHT = {"rocket": {"torch", "casadi", "scipy", "gymnasium"}, "envs": {"torch", "casadi", "scipy"}}
 LIGHT |= {"baselines": {"torch"}, "evaluate": {"torch", "casadi"}, "figures": {"torch", "casadi"}}
+LIGHT |= {"animation": {"torch", "casadi"}}
 
 
 @pytest.mark.parametrize("room", [room for room in LIGHT if (ROOT / f"{room}.py").exists()])
@@ -315,17 +318,20 @@ def trained(tmp_path_factory):
     here, folder = os.getcwd(), tmp_path_factory.mktemp("trained")
     os.chdir(folder)
     try:
-        DI.main([*TINY, "--total-updates=2", "--capture-video", "--no-observe-phase"])
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(animation, "FRAMES", 3)  # the others are drawn alike
+            DI.main([*TINY, "--total-updates=2", "--capture-video", "--no-observe-phase"])
     finally:
         os.chdir(here)
     (run,) = (folder / "runs").iterdir()
     return run
 
 
-def test_capture_video_draws_the_figures(trained):
-    names = {"training.png", "trajectories.png", "costs.png", "cost_error.png"}
+def test_capture_video_draws_the_figures_and_the_animation(trained):
+    names = {"training.png", "trajectories.png", "costs.png", "cost_error.png", "animation.gif"}
     assert {path.name for path in (trained / "figures").iterdir()} == names
-    assert all(path.read_bytes().startswith(b"\x89PNG") for path in (trained / "figures").iterdir())
+    heads = {".png": b"\x89PNG", ".gif": b"GIF89a"}
+    assert all(path.read_bytes().startswith(heads[path.suffix]) for path in (trained / "figures").iterdir())
 
 
 def test_hyperparameters_are_logged_as_text(trained):

@@ -1,0 +1,351 @@
+"""animation.py and `render`: the GIF as Pillow reads it, frames of every environment, and what the drawings show."""
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.error import ResetNeeded
+from gymnasium.utils.env_checker import check_env
+from gymnasium.wrappers import RecordVideo, RenderCollection
+from PIL import Image
+
+import animation
+import envs
+import evaluate
+from animation import Ascent, Flight, PhasePlane
+
+ROOT = Path(__file__).parents[1]
+IDS = [*envs.PROBLEMS, *envs.ROCKETS]
+SHAPE = (450, 800, 3)
+RED, BLUE, GREEN = (214, 39, 40), (31, 119, 180), (44, 160, 44)  # tab:red, tab:blue, tab:green
+
+
+def pixels_like(frame, colour):
+    """How many pixels of a frame are within 30 of a colour in each channel."""
+    return int((np.abs(np.asarray(frame, dtype=int) - colour) <= 30).all(axis=-1).sum())
+
+
+def frames_of(path):
+    """The frames (uint8) and durations (ms) of a GIF, as Pillow plays it."""
+    frames, durations = [], []
+    with Image.open(path) as image:
+        assert image.format == "GIF" and image.info["loop"] == 0
+        for k in range(image.n_frames):
+            image.seek(k)
+            frames.append(np.asarray(image.convert("RGB")))
+            durations.append(image.info["duration"])
+    return frames, durations
+
+
+def copied(result, folder):
+    """A folder with the evaluation of a result, as a run's has it: no seeds, no figures."""
+    folder.mkdir()
+    for name in ("eval.json", "eval.npz"):
+        shutil.copy(ROOT / "results" / result / name, folder)
+    return folder
+
+
+def command_line(monkeypatch, *argv):
+    monkeypatch.setattr(sys, "argv", ["evaluate.py", *map(str, argv)])
+    evaluate.main()
+
+
+# --- the GIF ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("result", ["rocket_cutoff", "rocket_fixed", "di", "di_waypoints", "vdp", "vdp_waypoints"])
+def test_animate_writes_a_gif(result, tmp_path, monkeypatch, capsys):
+    """Of any folder with an evaluation: both sides move, the last frame is held, nothing but the GIF is left."""
+    monkeypatch.setattr(animation, "FRAMES", 5)
+    folder = copied(result, tmp_path / "run")
+    command_line(monkeypatch, "animate", folder)
+    path = folder / "figures" / "animation.gif"
+    assert capsys.readouterr().out == f"{path}\n" and [*path.parent.iterdir()] == [path]
+    frames, durations = frames_of(path)
+    assert all(frame.shape == SHAPE for frame in frames)
+    assert durations == [80] * 4 + [2000]
+    assert all((before != after).any() for before, after in zip(frames, frames[1:]))
+    assert pixels_like(frames[-1], GREEN) > 50 or "rocket" in result  # there the target is pale
+    for colour in (RED, BLUE):
+        assert pixels_like(frames[-1], colour) > pixels_like(frames[0], colour)
+
+
+@pytest.mark.parametrize("result", ["rocket_cutoff", "di", "vdp_waypoints"])
+def test_shipped_gifs_are_small_and_short(result):
+    path = ROOT / "results" / result / "figures" / "animation.gif"
+    frames, durations = frames_of(path)
+    assert path.stat().st_size < 3e6 and frames[0].shape == SHAPE
+    assert 8000 <= sum(durations) <= 15000 and durations[-1] >= 2000
+    assert all(1000 / 15 <= duration <= 1000 / 12 for duration in durations[:-1])
+
+
+def test_readme_begins_with_a_gif_that_is_there():
+    image = next(line for line in (ROOT / "README.md").read_text().splitlines() if line.startswith("!["))
+    path = ROOT / image[image.index("(") + 1 : image.index(")")]
+    assert path.suffix == ".gif" and path.is_file()
+
+
+@pytest.mark.parametrize("fault", ["no folder", "no npz", "other id", "short", "nan"])
+def test_bad_folders_are_one_line_and_write_nothing(fault, tmp_path, monkeypatch):
+    folder = copied("rocket_cutoff", tmp_path / "run")
+    with np.load(folder / "eval.npz") as file:
+        arrays = dict(file)
+    if fault == "no folder":
+        shutil.rmtree(folder)
+    elif fault == "no npz":
+        (folder / "eval.npz").unlink()
+    elif fault == "other id":
+        (folder / "eval.json").write_text(json.dumps({"env_id": "CartPole-v1", "seed": 1}))
+    elif fault == "short":
+        np.savez(folder / "eval.npz", **{**arrays, "u": arrays["u"][:-7]})
+    else:
+        arrays["y_reference"][3, 2] = np.nan
+        np.savez(folder / "eval.npz", **arrays)
+    words = {"no folder": "eval.json", "no npz": "eval.npz", "other id": "env_id must be", "short": r"u \(456, 3\)"}
+    with pytest.raises(SystemExit, match=words.get(fault, "the optimum's flight holds a NaN")) as refusal:
+        command_line(monkeypatch, "animate", folder)
+    assert str(refusal.value).startswith("evaluate.py: ") and "\n" not in str(refusal.value)
+    assert not [*tmp_path.rglob("*.gif"), *tmp_path.rglob("*.tmp")]
+
+
+def test_failing_write_leaves_the_old_gif(tmp_path, monkeypatch):
+    metrics, arrays = evaluate.read_evaluation(ROOT / "results" / "di")
+    monkeypatch.setattr(animation, "FRAMES", 3)
+    (tmp_path / "animation.gif").write_bytes(b"old")
+    monkeypatch.setattr(animation.PhasePlane, "show", lambda *sides, ended: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        animation.write(tmp_path, arrays, metrics)
+    assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"old"]
+
+
+# --- what the drawings show -------------------------------------------------------------------------------------------
+
+
+def test_a_flight_until_a_time():
+    flight = Flight(np.array([0.0, 2.0, 3.0]), np.array([[7.0], [8.0]]), np.array([[0.0, 1.0], [4.0, 1.0], [4.0, 3.0]]))
+    assert flight.until(3.0) is flight and flight.until(99.0) is flight
+    for time, times, controls, state in [
+        (0.0, [0, 0], [7], [0, 1]),
+        (0.5, [0, 0.5], [7], [1, 1]),
+        (2.5, [0, 2, 2.5], [7, 8], [4, 2]),
+    ]:
+        part = flight.until(time)
+        assert part.t.tolist() == times and part.u[:, 0].tolist() == controls and part.y[-1].tolist() == state
+
+
+def rocket_flight(result="rocket_cutoff", suffix=""):
+    with np.load(ROOT / "results" / result / "eval.npz") as file:
+        return Flight(*(file[f"{key}{suffix}"] for key in ("t", "u", "y")))
+
+
+@pytest.mark.parametrize("time", [100.0, 400.0, 800.0, 924.0])
+def test_the_orbit_is_that_of_a_coast(time):
+    """RK4 through half a revolution without thrust, air or ground stays on the ellipse that is drawn."""
+    sheet, mu = Ascent(envs.ROCKET), envs.ROCKET.mu
+    y = rocket_flight().until(time).y[-1]
+
+    def fall(x, _):
+        return x[1], -mu * x[0] / np.linalg.norm(x[0]) ** 3
+
+    x, coast = (y[:3], y[3:6]), [y[:3]]
+    for _ in range(600):
+        x = envs.rk4(fall, x, None, 1.0)
+        coast.append(x[0])
+    drawn, flown = sheet._orbit(y).T, (sheet.axes @ np.array(coast[::50]).T)[:2].T
+    # distance to the polygon: its corners are up to one degree of arc apart
+    start, edge = drawn[:-1, None], np.diff(drawn, axis=0)[:, None]
+    along = ((flown - start) * edge).sum(-1) / np.maximum((edge * edge).sum(-1), 1e-9)
+    distance = np.linalg.norm(flown - start - along.clip(0, 1)[..., None] * edge, axis=-1).min(axis=0)
+    assert distance.max() < 2e-3 * np.linalg.norm(y[:3])
+
+
+def test_the_path_is_altitude_over_downrange():
+    flight, sheet = rocket_flight(), Ascent(envs.ROCKET)
+    sheet.show([flight])
+    x, altitude = sheet.paths[0].get_data()
+    r = flight.y[:, :3]
+    assert altitude == pytest.approx(np.linalg.norm(r, axis=1) / 1e3 - 6378.145, abs=1e-6)
+    # the angle between two directions; the flight leaves the target's plane by less than half a degree
+    cosine = r @ r[0] / np.linalg.norm(r, axis=1) / np.linalg.norm(r[0])
+    assert x == pytest.approx(np.arccos(cosine.clip(-1, 1)) * 6378.145, abs=10)
+    assert x[-1] > 5000
+
+
+@pytest.mark.parametrize(
+    "time, ended, shown",
+    [
+        (74.0, False, []),
+        (76.0, False, ["75 s: 6 engines, 13.7 t"]),
+        (924.0, False, ["75 s: 6 engines, 13.7 t", "150 s: 3 engines, 6.8 t", "261 s: 1 engine, 8.8 t"]),
+        (9e9, True, ["75 s: 6 engines, 13.7 t", "150 s: 3 engines, 6.8 t", "261 s: 1 engine, 8.8 t", "925 s: cut-off"]),
+    ],
+)
+def test_stagings_are_named_when_they_happen(time, ended, shown):
+    sheet = Ascent(envs.ROCKET)
+    sheet.show([rocket_flight().until(time)], ended=ended)
+    assert [label.get_text().replace(" dropped", "") for label in sheet.labels if label.get_visible()] == shown
+    assert len(sheet.marks.get_xdata()) == min(len(shown), 3)
+    assert sheet.flame.get_visible() != ended
+
+
+def test_other_ends_are_named():
+    crash = envs.fly_rocket("RocketAscent-v0", lambda obs, t: np.array([[-1.0, 0.0, 0.0]]), action_frame="local")
+    sheet = Ascent(envs.ROCKET)
+    for flight, name in (
+        (Flight(crash["t"], crash["u"], crash["y"]), "crash"),
+        (rocket_flight("rocket_fixed"), "burn"),
+    ):
+        sheet.show([flight], ended=True)
+        assert [label.get_text() for label in sheet.labels if label.get_visible()][-1].endswith(name)
+
+
+def test_circles_are_round_and_everything_is_in_view():
+    flight = envs.fly("DoubleIntegrator-v0", lambda obs, t: np.full((1, 1), 4.0), np.array([[1.0, 1.0]]))
+    sheet = PhasePlane(envs.DOUBLE_INTEGRATOR)
+    sheet.frame(Flight(0.1 * np.arange(51), flight["u"][0][:, None], flight["x"][0]))
+    (left, bottom), (right, top) = sheet.plane.transData.transform([[-1, -1], [1, 1]])
+    assert right - left == pytest.approx(top - bottom)
+    assert sheet.plane.get_xlim()[1] > flight["x"][0, -1, 0] and sheet.plane.get_ylim()[1] > flight["x"][0, -1, 1]
+    with_bounds = sheet.position.get_ylim()
+    assert with_bounds[1] > flight["x"][0, -1, 0] > 40
+
+
+# --- render_mode="rgb_array" ------------------------------------------------------------------------------------------
+
+
+def options_of(env_id):
+    return {"action_frame": "local"} if env_id in envs.ROCKETS else {}
+
+
+def action_of(env):
+    """A climb, or half the largest control."""
+    return np.array([1.0, 0.2, 0.0]) if env.action_space.shape == (3,) else env.action_space.high / 2
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_frames_of_the_single_environment(env_id):
+    env = gym.make(env_id, render_mode="rgb_array", **options_of(env_id))
+    assert env.metadata["render_modes"] == ["rgb_array"] and env.metadata["render_fps"] > 0
+    env.reset(seed=1)
+    frames = [env.render()]
+    for steps in (1, 4):
+        for _ in range(steps):
+            env.step(action_of(env))
+        frames.append(env.render())
+    assert all(frame.shape == SHAPE and frame.dtype == np.uint8 for frame in frames)
+    assert (frames[0] != frames[1]).any() and (frames[1] != frames[2]).any()
+    assert np.array_equal(env.render(), frames[2])  # a look changes nothing
+    assert pixels_like(frames[2], RED) > 20 and not pixels_like(frames[2], BLUE)
+    env.reset(seed=1)
+    assert np.array_equal(env.render(), frames[0])
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_frames_of_the_batch_are_those_of_single_environments(env_id):
+    batch = gym.make_vec(env_id, num_envs=2, render_mode="rgb_array", **options_of(env_id))
+    single = gym.make(env_id, render_mode="rgb_array", **options_of(env_id))
+    obs, _ = batch.reset(seed=3)
+    if env_id in envs.ROCKETS:
+        single.reset()
+    else:
+        single.reset(options={"x0": obs[1, :2]})
+    action = action_of(single)
+    for _ in range(3):
+        batch.step(np.stack([-action if env_id in envs.PROBLEMS else [1.0, 0.0, 0.0], action]))
+        single.step(action)
+    frames = batch.render()
+    assert isinstance(frames, tuple) and len(frames) == 2
+    assert np.array_equal(frames[1], single.render()) and (frames[0] != frames[1]).any()
+
+
+def test_after_autoreset_the_next_episode_is_drawn():
+    batch = gym.make_vec("RocketAscent-v0", num_envs=2, render_mode="rgb_array", action_frame="local")
+    batch.unwrapped.end_time = 6.0
+    batch.reset()
+    begin = batch.render()[0]
+    for _ in range(3):
+        assert np.array_equal(batch.render()[0], begin) == (batch.unwrapped.t[0] == 0)
+        _, _, terminated, _, _ = batch.step(np.tile([1.0, 0.2, 0.0], (2, 1)))
+    assert terminated.all() and np.array_equal(batch.render()[0], begin)
+
+
+@pytest.mark.parametrize("env_id", ["VanDerPol-v0", "RocketAscent-v0"])
+def test_rendering_changes_no_number(env_id):
+    """The frames are kept copies: neither the flight nor what was recorded earlier moves."""
+    plain, drawn = (gym.make(env_id, render_mode=mode, **options_of(env_id)) for mode in (None, "rgb_array"))
+    for env in (plain, drawn):
+        env.reset(seed=5)
+    drawn.render()
+    for _ in range(5):
+        one, other = (env.step(action_of(env)) for env in (plain, drawn))
+        assert np.array_equal(one[0], other[0]) and one[1] == other[1]
+    trail = drawn.unwrapped.batch._trails[0]
+    assert len(trail) == 6 and len({tuple(state) for _, _, state in trail}) == 6
+    assert plain.unwrapped.batch._trails == [[]]  # nothing is kept that nobody will look at
+
+
+@pytest.mark.parametrize("env_id", ["DoubleIntegrator-v0", "RocketAscentCutoff-v0"])
+def test_without_a_mode_render_warns(env_id):
+    env, batch = gym.make(env_id), gym.make_vec(env_id, num_envs=2)
+    for one in (env, batch):
+        one.reset()
+        with pytest.warns(UserWarning, match=f'without specifying any render mode.*gym.make."{env_id}", render_mode='):
+            assert one.render() is None
+
+
+def test_bad_render_modes_and_render_before_reset_are_refused():
+    with pytest.raises(ValueError, match="render_mode is 'ansi'; it must be one of None, rgb_array"):
+        gym.make_vec("VanDerPol-v0", num_envs=2, render_mode="ansi")
+    with (
+        pytest.warns(UserWarning, match="render_mode='ansi'"),
+        pytest.raises(ValueError, match="render_mode is 'ansi'"),
+    ):
+        gym.make("RocketAscent-v0", render_mode="ansi")
+    with pytest.raises(ResetNeeded, match="call reset"):
+        gym.make_vec("VanDerPol-v0", num_envs=2, render_mode="rgb_array").render()
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_check_env_with_rendering(env_id, recwarn):
+    check_env(gym.make(env_id, render_mode="rgb_array").unwrapped)
+    assert not [str(w.message) for w in recwarn if "symmetric and normalized" not in str(w.message)]
+
+
+def test_gymnasiums_own_ways_to_collect_frames(tmp_path):
+    """A list of frames by `rgb_array_list`, and RecordVideo, where MoviePy is there to encode."""
+    env = gym.make("DoubleIntegrator-v0", render_mode="rgb_array_list")
+    assert isinstance(env, RenderCollection)
+    env.reset(seed=0)
+    for _ in range(2):
+        env.step(action_of(env))
+    frames = env.render()
+    assert len(frames) == 3 and all(frame.shape == SHAPE for frame in frames)
+    pytest.importorskip("moviepy")
+    env = RecordVideo(gym.make("RocketAscent-v0", render_mode="rgb_array", action_frame="local"), str(tmp_path))
+    env.unwrapped.end_time = 6.0
+    env.reset()
+    while not env.step(action_of(env))[2]:
+        pass
+    env.close()
+    (video,) = tmp_path.glob("*.mp4")
+    assert video.stat().st_size > 1000
+
+
+def test_nothing_is_imported_until_a_frame_is_asked_for():
+    code = """
+import sys, gymnasium as gym, numpy as np, envs
+env = gym.make_vec("DoubleIntegrator-v0", num_envs=2, render_mode="rgb_array")
+env.reset(seed=0)
+env.step(np.zeros((2, 1)))
+heavy = {"matplotlib", "PIL", "animation", "figures"}
+print(sorted(heavy & sys.modules.keys()))
+env.render()
+print(sorted((heavy | {"matplotlib.pyplot", "torch", "casadi", "scipy"}) & sys.modules.keys()))
+"""
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines() == ["[]", "['PIL', 'animation', 'figures', 'matplotlib']"]

@@ -1,0 +1,89 @@
+"""Stable-Baselines3 on these environments, in its own ways and by the native batch; skipped where it is missing."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import envs
+
+pytest.importorskip("stable_baselines3")
+from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.env_checker import check_env
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
+
+from sb3_env import NativeVecEnv
+
+IDS = ["VanDerPolWaypoints-v0", "RocketAscentCutoff-v0"]
+OPTIONS = {env_id: {"action_frame": "local"} if env_id in envs.ROCKETS else {} for env_id in IDS}
+
+
+def native(env_id, num_envs, **options):
+    return NativeVecEnv(gym.make_vec(env_id, num_envs=num_envs, **OPTIONS.get(env_id, {}), **options))
+
+
+def weights(model):
+    return np.concatenate([weight.detach().numpy().ravel() for weight in model.policy.parameters()])
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_its_checker_accepts_the_single_environments(env_id):
+    check_env(gym.make(env_id, **OPTIONS[env_id]).unwrapped)
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_ppo_learns_in_its_own_vector_environments(env_id):
+    dummy = DummyVecEnv([lambda: gym.make(env_id, **OPTIONS[env_id])] * 2)
+    made = make_vec_env(env_id, n_envs=2, env_kwargs=OPTIONS[env_id])
+    for venv in (dummy, made, VecMonitor(native(env_id, 2))):
+        model = PPO("MlpPolicy", VecNormalize(venv), n_steps=16, batch_size=16, n_epochs=1, device="cpu", seed=0)
+        before = weights(model)
+        model.learn(64)
+        after = weights(model)
+        assert np.isfinite(after).all() and (after != before).any() and model.num_timesteps == 64
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_sac_learns_on_a_single_environment(env_id):
+    env = gym.make(env_id, **OPTIONS[env_id])
+    model = SAC("MlpPolicy", env, learning_starts=8, batch_size=8, buffer_size=100, device="cpu", seed=0)
+    before = weights(model)
+    model.learn(24)
+    after = weights(model)
+    assert np.isfinite(after).all() and (after != before).any()
+    assert env.action_space.contains(model.predict(env.reset()[0])[0].astype(np.float64))
+
+
+def test_native_batch_flies_as_a_dummy_of_single_rockets():
+    """The same actions through both, over a crash and into the next episode."""
+    env_id, steps = "RocketAscent-v0", 40
+    batch = NativeVecEnv(gym.make_vec(env_id, num_envs=2))
+    dummy = DummyVecEnv([lambda: gym.make(env_id)] * 2)
+    assert batch.reset() == pytest.approx(dummy.reset().astype(np.float32))
+    actions, ends = np.array([[1.0, 0.0, 0.5], [-1.0, 0.3, -0.5]]), 0
+    for _ in range(steps):
+        ours, theirs = batch.step(actions), dummy.step(actions)
+        for one, other in zip(ours[:3], theirs[:3]):
+            assert one == pytest.approx(other, rel=1e-6)
+        for one, other in zip(ours[3], theirs[3]):
+            assert ("terminal_observation" in one) == ("terminal_observation" in other)
+            if "terminal_observation" in one:
+                ends += 1
+                assert one["terminal_observation"] == pytest.approx(other["terminal_observation"], rel=1e-6)
+                assert one["crashed"] and other["crashed"] and one["error_norm"] == other["error_norm"]
+                assert not one["TimeLimit.truncated"] and not other["TimeLimit.truncated"]
+    assert ends >= 2
+
+
+def test_native_batch_keeps_the_interface():
+    batch = native("VanDerPolWaypoints-v0", 3, render_mode="rgb_array")
+    batch.seed(4)
+    first = batch.reset()
+    second = batch.reset()  # a seed is used once
+    batch.seed(4)
+    assert np.array_equal(batch.reset(), first) and (first != second).any() and first.dtype == np.float32
+    assert [image.shape for image in batch.get_images()] == [(450, 800, 3)] * 3
+    assert batch.get_attr("num_envs") == [3] * 3 and batch.get_attr("num_envs", [0, 2]) == [3] * 2
+    assert batch.has_attr("radius_scale") and not batch.has_attr("no_such")
+    batch.set_attr("radius_scale", 2.0)
+    assert batch.batch.radius_scale == 2.0 and batch.env_is_wrapped(gym.Wrapper, 1) == [False]
