@@ -25,7 +25,7 @@ import safetensors.numpy
 
 import baselines
 import envs
-from baselines import replacing
+from baselines import replacing, starts
 from envs import BadInput
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -36,17 +36,12 @@ PAPER_STARTS, PAPER_DRAWS = 10, 100  # the paper reports the mean ratio of ten s
 NEAR_ORIGIN = 0.2  # |x0| within which J* is so small that the ratio says little and the loss J - J* says more
 
 
-def starts(seed: int, n: int) -> np.ndarray:
-    """The n evaluation starts (n, 2) of a seed: uniform in the paper's "state bounds", [-1, 1] in each component."""
-    return np.random.default_rng(seed).uniform(-1, 1, (n, 2))
-
-
 @lru_cache(maxsize=4)  # evaluations during training fly the same starts again and again
 def optimum(env_id: str, eval_seed: int, n: int) -> dict:
     """`baselines.reference` from the n starts of a seed; of a rocket, which has one start, the flown optimum."""
     if env_id in envs.ROCKETS:
         return baselines.rocket_reference(env_id)
-    return baselines.reference(env_id, starts(eval_seed, n))
+    return baselines.reference(env_id, starts(eval_seed, n, envs.PROBLEMS[env_id].x0_max))
 
 
 def evaluate(env_id, policy, eval_seed: int, n: int, reference: dict | None = None, **env_options):
@@ -58,7 +53,7 @@ def evaluate(env_id, policy, eval_seed: int, n: int, reference: dict | None = No
     """
     if env_id in envs.ROCKETS:
         return evaluate_rocket(env_id, policy, eval_seed, reference, **env_options)
-    x0 = starts(eval_seed, n)
+    x0 = starts(eval_seed, n, envs.PROBLEMS[env_id].x0_max)
     flight = envs.fly(env_id, policy, x0, **env_options)
     reference = optimum(env_id, eval_seed, n) if reference is None else reference
     if not np.array_equal(reference["x"][:, 0], x0):
