@@ -266,6 +266,7 @@ class PhasedVectorEnv(BatchedEnv):
         self.radius_scale, self.flights_per_start = 1.0, 1
         multi_phase = len(problem.phases) > 1
         target_max = np.max([np.abs(phase.target) for phase in problem.phases], axis=0)
+        target_max[target_max == 0] = 1.0  # of velocity, where all waypoints are at rest: a box must have a width
         high = np.array([*problem.x_max, *target_max, 1.0, 1.0] if multi_phase else [*problem.x_max, 1.0])
         low = -high
         low[-2 if multi_phase else -1 :] = 0.0

@@ -5,6 +5,7 @@ What holds for every problem is asked of every one in `PROBLEMS`: also that `x_m
 
 import math
 import warnings
+from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
@@ -274,6 +275,14 @@ def test_check_env(env_id):
         check_env(env.unwrapped)
     unexpected = [str(w.message) for w in caught if "symmetric and normalized" not in str(w.message)]
     assert not unexpected
+
+
+def test_waypoints_at_rest_have_a_box_with_a_width(new_problem):
+    """All velocities 0: Gymnasium warns of bounds that are equal."""
+    phases = tuple(replace(phase, target=(phase.target[0], 0.0)) for phase in PROBLEMS["VanDerPolWaypoints-v0"].phases)
+    env_id = new_problem(replace(PROBLEMS["VanDerPolWaypoints-v0"], env_id="AtRest-v0", phases=phases))
+    space = gym.make_vec(env_id, num_envs=1).single_observation_space
+    assert (space.low[:4] < space.high[:4]).all() and space.high[2] == 0.5
 
 
 @pytest.mark.parametrize("env_id", PROBLEMS)
