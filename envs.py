@@ -114,7 +114,11 @@ class Phase:
 
 @dataclass(frozen=True)
 class Problem:
-    """A parameter table: dynamics, control bound, phases; `x_max` (ours) bounds every state reachable from the box."""
+    """A parameter table: dynamics, control bound, phases; `x_max` (ours) bounds every state reachable from the box.
+
+    `single_optimum` is a promise that IPOPT ends in the same optimum from every guess, so that the reference tries one
+    (see `baselines.guesses`): left out, a new problem's reference is the best of several.
+    """
 
     env_id: str
     f: Callable
@@ -123,6 +127,7 @@ class Problem:
     x_max: tuple[float, float]
     dt: float = 0.1  # s
     x0_max: float = 1.0  # the table's "state bounds", by our reading the box of the initial states, never a constraint
+    single_optimum: bool = False
 
     @property
     def steps(self) -> int:
@@ -136,6 +141,7 @@ DOUBLE_INTEGRATOR = Problem(
     u_max=4.0,
     phases=(Phase(steps=50, target=(0.0, 0.0), radius=0.05, R=0.1, Qf=20.0, bonus=20.0),),
     x_max=(57.0, 22.0),  # |x2| <= 1 + u T, |x1| <= 1 + T + u T^2 / 2, and room for rounding
+    single_optimum=True,
 )
 
 DOUBLE_INTEGRATOR_WAYPOINTS = Problem(
@@ -147,6 +153,7 @@ DOUBLE_INTEGRATOR_WAYPOINTS = Problem(
         Phase(steps=50, target=(0.5, 0.5), radius=0.02, R=0.1, Qf=30.0, bonus=20.0),
     ),
     x_max=(162.0, 32.0),
+    single_optimum=True,
 )
 
 VAN_DER_POL = Problem(
@@ -155,6 +162,7 @@ VAN_DER_POL = Problem(
     u_max=1.5,
     phases=(Phase(steps=70, target=(0.0, 0.0), radius=0.05, R=1.0, Qf=20.0, bonus=20.0),),
     x_max=(19.0, 19.0),  # |x|' <= epsilon |x| + u, so |x(T)| <= (sqrt 2 + u / epsilon) e^(epsilon T) - u / epsilon
+    single_optimum=True,
 )
 
 VAN_DER_POL_WAYPOINTS = Problem(
@@ -167,6 +175,7 @@ VAN_DER_POL_WAYPOINTS = Problem(
         Phase(steps=50, target=(0.5, 0.5), radius=0.05, R=0.01, Qf=40.0, bonus=40.0),
     ),
     x_max=(52.0, 52.0),
+    single_optimum=True,
 )
 
 PROBLEMS = {
@@ -321,6 +330,7 @@ class PhasedVectorEnv(BatchedEnv):
         self.radius_scale, self.flights_per_start = 1.0, 1
         multi_phase = len(problem.phases) > 1
         target_max = np.max([np.abs(phase.target) for phase in problem.phases], axis=0)
+        target_max[target_max == 0] = 1.0  # of velocity, where all waypoints are at rest: a box must have a width
         high = np.array([*problem.x_max, *target_max, 1.0, 1.0] if multi_phase else [*problem.x_max, 1.0])
         low = -high
         low[-2 if multi_phase else -1 :] = 0.0

@@ -26,7 +26,7 @@ import safetensors.numpy
 
 import baselines
 import envs
-from baselines import replacing
+from baselines import replacing, starts
 from envs import BadInput
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -37,17 +37,12 @@ PAPER_STARTS, PAPER_DRAWS = 10, 100  # the paper reports the mean ratio of ten s
 NEAR_ORIGIN = 0.2  # |x0| within which J* is so small that the ratio says little and the loss J - J* says more
 
 
-def starts(seed: int, n: int) -> np.ndarray:
-    """The n evaluation starts (n, 2) of a seed: uniform in the paper's "state bounds", [-1, 1] in each component."""
-    return np.random.default_rng(seed).uniform(-1, 1, (n, 2))
-
-
 @lru_cache(maxsize=4)  # evaluations during training fly the same starts again and again
 def optimum(env_id: str, eval_seed: int, n: int) -> dict:
     """`baselines.reference` from the n starts of a seed; of a rocket, which has one start, the flown optimum."""
     if env_id in envs.ROCKETS:
         return baselines.rocket_reference(env_id)
-    return baselines.reference(env_id, starts(eval_seed, n))
+    return baselines.reference(env_id, starts(eval_seed, n, envs.PROBLEMS[env_id].x0_max))
 
 
 def evaluate(env_id, policy, eval_seed: int, n: int, reference: dict | None = None, **env_options):
@@ -59,7 +54,7 @@ def evaluate(env_id, policy, eval_seed: int, n: int, reference: dict | None = No
     """
     if env_id in envs.ROCKETS:
         return evaluate_rocket(env_id, policy, eval_seed, reference, **env_options)
-    x0 = starts(eval_seed, n)
+    x0 = starts(eval_seed, n, envs.PROBLEMS[env_id].x0_max)
     flight = envs.fly(env_id, policy, x0, **env_options)
     reference = optimum(env_id, eval_seed, n) if reference is None else reference
     if not np.array_equal(reference["x"][:, 0], x0):
@@ -130,13 +125,13 @@ def ratio_metrics(cost: np.ndarray, reference_cost: np.ndarray, eval_seed: int) 
 
 
 def near_origin_metrics(env_id: str, x0: np.ndarray, cost: np.ndarray, reference_cost: np.ndarray) -> dict:
-    """The mean loss J - J* of the starts x0 (m, 2) near the origin; without one, or with waypoints, no key.
+    """The mean loss J - J* of the starts x0 (m, 2) near the origin; without one, or with another target, no key.
 
     There J* vanishes with |x0|^2, so that a loss c makes a start's ratio 1 + c / J* as large as one likes, and a few
     such starts make the mean ratio of all. With waypoints J* does not vanish: the second is not at the origin.
     """
-    near = np.hypot(*x0.T) <= NEAR_ORIGIN
-    if len(envs.PROBLEMS[env_id].phases) > 1 or not near.any():
+    near, (first, *later) = np.hypot(*x0.T) <= NEAR_ORIGIN, envs.PROBLEMS[env_id].phases
+    if later or any(first.target) or not near.any():
         return {}
     return {"loss_near_origin_mean": float((cost - reference_cost)[near].mean())}
 
@@ -204,7 +199,7 @@ def ratio_lines(metrics: dict) -> list[str]:
     if None not in draws.values():  # fewer than ten starts, or an older eval.json
         interval = f"{draws['p05']:.4f} to {draws['p95']:.4f} (5 % to 95 %), median {draws['p50']:.4f}"
         lines.append(f"      {PAPER_DRAWS} draws of ten: {interval}")
-    if not waypoints:
+    if not waypoints and not any(envs.PROBLEMS[metrics["env_id"]].phases[0].target):
         lines.append("      dominated by starts near the origin, where the optimal cost J* vanishes")
     lines.append(f"    ratio of sums {metrics['ratio_of_sums']:.4f}")
     statistics = ", ".join(f"{s} {metrics[f'ratio_{s}']:.4f}" for s in ("min", "median", "max", "p95"))
@@ -249,17 +244,20 @@ def write(metrics: dict, arrays: dict, checkpoint, json_path, npz_path):
         write_npz(npz_path, arrays)
 
 
-def read_checkpoint(path, expected: dict[str, type]) -> dict:
+def read_checkpoint(path, expected: dict[str, type], env_ids=()) -> dict:
     """An agent.safetensors: `args` (the run's arguments), `progress` (its counters), `tensors` (NumPy arrays).
 
-    `expected` gives the type of each argument that must be there. Raises BadInput if the file is missing, damaged or
-    of something else, or holds a weight that is not finite.
+    `expected` gives the type of each argument that must be there, `env_ids` the environments that it may be of (none:
+    any). Raises BadInput if the file is missing, damaged or of something else, or holds a weight that is not finite.
     """
     try:
         data = Path(path).read_bytes()
         tensors = safetensors.numpy.load(data)
         metadata = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])["__metadata__"]
         args = json.loads(metadata["args"])
+        env_id = args["env_id"]
+        if env_ids and isinstance(env_id, str) and env_id not in env_ids:  # another script's has other arguments, too
+            raise BadInput(f"--checkpoint {path}: is of {env_id}; this script takes {', '.join(env_ids)}")
         wrong = [name for name, kind in expected.items() if type(args[name]) is not kind]
         metadata.setdefault("training_seconds", metadata["wall_seconds"])  # an older file counted no other time
         counters = {"seed": int, "total_updates": int, "global_step": int}
@@ -267,6 +265,8 @@ def read_checkpoint(path, expected: dict[str, type]) -> dict:
         progress = {name: kind(metadata[name]) for name, kind in counters.items()}
         if not all(math.isfinite(value) and value >= 0 for value in progress.values()):
             raise ValueError(f"its counters are {progress}")
+    except BadInput:
+        raise
     except OSError as error:
         raise BadInput(f"--checkpoint {path}: {error.strerror}; it must be an agent.safetensors") from error
     except (safetensors.SafetensorError, KeyError, TypeError, ValueError) as error:

@@ -12,6 +12,7 @@ import gc
 import importlib.util
 import io
 import json
+import math
 import os
 import signal
 import sys
@@ -109,6 +110,7 @@ def parse_args(kind, argv, env_options, buffers):
     elif args.eval_only:
         refuse("checkpoint", None, "must name the agent.safetensors that --eval-only flies")
     check(args, typed, env_ids)
+    check_buffers(args, buffers[args.env_id])
     if args.gae_lambda_final is None:
         args.gae_lambda_final = args.gae_lambda
     if args.eval_starts is None:
@@ -122,7 +124,7 @@ def read_checkpoint(args, kind, typed, env_options, buffers):
     Its environment may be another with the same buffers, and its noise is gone on with, unless a flag says otherwise.
     """
     decided = {name: type(getattr(kind, name)) for name in ("env_id", *env_options, *NETWORK)}
-    saved = evaluate.read_checkpoint(args.checkpoint, decided)
+    saved = evaluate.read_checkpoint(args.checkpoint, decided, tuple(buffers))
     for name in decided:
         value, given = saved["args"][name], getattr(args, name)
         if name == "env_id" and name in typed and value != given and buffers.get(value) == buffers.get(given):
@@ -155,6 +157,26 @@ def check(args, typed, env_ids):
     if args.track and importlib.util.find_spec("wandb") is None:
         refuse("track", "", "needs wandb: pip install wandb")
     check_share(args, typed)
+
+
+def check_buffers(args, buffers):
+    """Refuse a script's BUFFERS whose scale does not fit the observations, and an id that no environment has.
+
+    buffers are those of --env-id. Only `observation_scale` is one number an observation; the others are the script's.
+    """
+    try:
+        spec = gym.spec(args.env_id)
+    except gym.error.Error:
+        refuse("env_id", args.env_id, "no environment of this id is registered; envs.PROBLEMS must have it")
+    scale = buffers.get("observation_scale")
+    if scale is None:
+        return
+    (inputs,) = gym.make_vec(spec, num_envs=1).single_observation_space.shape
+    if len(scale) != inputs:
+        allowed = f"must hold {inputs} numbers, one for each of its observations"
+        fail(f"BUFFERS of {args.exp_name}.py: observation_scale of {args.env_id} holds {len(scale)}; {allowed}")
+    if not all(math.isfinite(number) and number for number in scale):
+        fail(f"BUFFERS of {args.exp_name}.py: observation_scale of {args.env_id} is {scale}; must be finite, without 0")
 
 
 def check_share(args, typed):
@@ -227,9 +249,16 @@ def load_checkpoint(agent, args, saved):
     """Put the weights of --checkpoint, if there is one, into a new agent; one line if they do not fit."""
     if args.checkpoint is None or args.resume is not None:
         return
+    expected = {name: tuple(tensor.shape) for name, tensor in agent.state_dict().items()}
+    shapes = {name: array.shape for name, array in saved["tensors"].items()}
+    if differing := [name for name in {**expected, **shapes} if expected.get(name) != shapes.get(name)]:
+        name = differing[0]
+        theirs, ours = (shape.get(name, "missing") for shape in (shapes, expected))
+        why = f"{name} is {theirs} in the file and {ours} in this script"
+        fail(f"--checkpoint {args.checkpoint}: does not fit its own args, BUFFERS or features ({why})")
     try:
         agent.load_state_dict({name: torch.from_numpy(array) for name, array in saved["tensors"].items()})
-    except (RuntimeError, TypeError) as error:
+    except (RuntimeError, TypeError) as error:  # a type that torch does not have
         fail(f"--checkpoint {args.checkpoint}: its weights do not fit its own args ({error})")
     if not saved["keeps_log_std"]:
         torch.nn.init.constant_(agent.actor_logstd, args.log_std)
@@ -462,8 +491,10 @@ def load_state(run_dir, kind, env_ids):
             raise ValueError(f"{damaged} is damaged")
         state = torch.load(path, map_location="cpu", weights_only=True)
         args, kinds = state["args"], get_type_hints(kind)
-        if args.keys() != kinds.keys() or args["env_id"] not in env_ids:
-            raise ValueError("of another script")
+        if args["env_id"] not in env_ids:
+            raise ValueError(f"it is of {args['env_id']}; this script takes {', '.join(env_ids)}")
+        if args.keys() != kinds.keys():
+            raise ValueError(f"{min(args.keys() ^ kinds.keys())} is not among the arguments of both")
         wrong = [name for name in kinds if not isinstance(args[name], kinds[name])]
         if wrong:
             raise ValueError(f"{wrong[0]} is {args[wrong[0]]!r}")

@@ -36,7 +36,7 @@ import envs  # noqa: E402
 import evaluate  # noqa: E402
 import runs  # noqa: E402
 
-SCRIPTS = [importlib.import_module(f"ppo_gtrxl_{name}") for name in ("di", "vdp", "rocket")]
+SCRIPTS = [importlib.import_module(path.stem) for path in sorted(ROOT.glob("ppo_gtrxl_*.py"))]
 NETWORK = ["--embed-dim=8", "--num-heads=2", "--num-blocks=1", "--memory-length=4", "--mlp-dim=8", "--hidden-dim=8"]
 TINY = [*NETWORK, "--num-envs=2", "--num-minibatches=2", "--update-epochs=2", "--eval-starts=10", "--num-threads=1"]
 PROCESSES = multiprocessing.get_context("forkserver")  # its children have torch already: each starts at once
@@ -167,7 +167,7 @@ def fuzz_arguments(count, seed=0):
     read_once = mock.patch("inspect.getsource", functools.cache(inspect.getsource))  # tyro reads it for each line
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder), read_once:
         for _ in range(count):
-            script = SCRIPTS[rng.integers(3)]
+            script = SCRIPTS[rng.integers(len(SCRIPTS))]
             argv = random_arguments(rng, script)
             try:
                 ended[outcome(parse_args, script, argv)] += 1
@@ -242,7 +242,7 @@ def load_state(script, folder):
 
 def fuzz_checkpoints(count, seed=0):
     """Damaged agent.safetensors and training_state.pt, and states that fit nothing or would run code."""
-    rng, ended, script = np.random.default_rng(seed), Counter(), SCRIPTS[0]
+    rng, ended, script = np.random.default_rng(seed), Counter(), importlib.import_module("ppo_gtrxl_di")
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
         with contextlib.redirect_stdout(io.StringIO()):
             script.main([*TINY, "--total-updates=1"])

@@ -1,5 +1,6 @@
 """What several test files share: environments whose episodes end at different times, one update, a benchmark."""
 
+import dataclasses
 import importlib
 import os
 import sys
@@ -7,9 +8,12 @@ from pathlib import Path
 
 os.environ["OMP_NUM_THREADS"] = "1"  # two workers on two cores, and whatever they start
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.spaces import Box
+
+import envs
 
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
 import one_update  # noqa: E402
@@ -53,6 +57,23 @@ class UnevenEnvs:
 @pytest.fixture
 def uneven_envs():
     return UnevenEnvs
+
+
+@pytest.fixture
+def new_problem(monkeypatch):
+    """A function that registers a `Problem` for one test, as a line in `envs.PROBLEMS` does; returns its id.
+
+    Solvers are kept by id: each test has ids of its own.
+    """
+
+    def register(problem):
+        like = gym.spec("VanDerPol-v0")
+        spec = dataclasses.replace(like, id=problem.env_id, kwargs={"env_id": problem.env_id})
+        monkeypatch.setitem(envs.PROBLEMS, problem.env_id, problem)
+        monkeypatch.setitem(gym.registry, problem.env_id, spec)
+        return problem.env_id
+
+    return register
 
 
 def update(script, args, modules, envs, batch, episodes=None, iteration=1):

@@ -11,7 +11,7 @@ import pytest
 
 import baselines
 from baselines import box_qp, hermite_simpson, lqr, lqr_policy, optimise, reference, replay
-from envs import DOUBLE_INTEGRATOR, PROBLEMS, VAN_DER_POL, fly
+from envs import DOUBLE_INTEGRATOR, PROBLEMS, VAN_DER_POL, Phase, Problem, double_integrator, fly
 
 ROOT = Path(__file__).resolve().parents[1]
 KEYS = {"x", "u", "reward", "episodic_return", "cost", "cost_state", "cost_control", "cost_terminal", "hit"}
@@ -195,6 +195,141 @@ def test_optimum_ends_on_the_edge_of_its_last_circle(env_id):
     np.testing.assert_allclose(optimum["terminal_error"][:, -1], radius, rtol=1e-8)
 
 
+# --- problems of a user's own -----------------------------------------------------------------------------------------
+
+
+def pendulum(x, u):
+    """About upright: x1' = x2, x2' = sin x1 + u."""
+    return x[1], np.sin(x[0]) + u
+
+
+def swing_up(env_id, seconds, u_max=0.3, **changes):
+    """A pendulum too weak to be lifted at once: it must be swung up."""
+    phase = Phase(steps=10 * seconds, target=(0.0, 0.0), radius=0.05, R=0.1, Qf=20.0, bonus=20.0)
+    return Problem(env_id, pendulum, u_max, (phase,), x_max=(100.0, 50.0), x0_max=np.pi, **changes)
+
+
+@pytest.fixture
+def hard_start():
+    """The eleventh of these starts."""
+    return (np.random.default_rng(1).uniform(-1, 1, (20, 2)) * (np.pi, 1))[10:11]
+
+
+def test_best_of_several_guesses_swings_a_pendulum_up(new_problem, hard_start):
+    """From one guess the pendulum ends elsewhere, at several times the cost; both are what the environment flies."""
+    one = reference(new_problem(swing_up("OneGuess-v0", 15, single_optimum=True)), hard_start)
+    best = reference(new_problem(swing_up("SeveralGuesses-v0", 15)), hard_start)
+    assert best["cost"][0] < 0.5 * one["cost"][0]
+    assert best["hit"].all() and np.abs(best["u"]).max() <= 0.3
+    x, u = best["x"][0], best["u"][0]
+    assert best["cost"][0] == pytest.approx((x[:-1] ** 2).sum() + 0.1 * (u**2).sum() + 20 * (x[-1] ** 2).sum())
+
+
+def test_guess_that_fails_is_no_error(new_problem):
+    """Over 20 s IPOPT finds no way from rest; from the two flights it does."""
+    x0 = np.random.default_rng(1).uniform(-1, 1, (1, 2)) * (np.pi, 1)
+    with pytest.raises(RuntimeError, match="start 0, .* of Fails-v0: IPOPT stopped with"):
+        optimise(new_problem(swing_up("Fails-v0", 20, single_optimum=True)), x0)
+    u, cost, feasible = optimise(new_problem(swing_up("FailsNot-v0", 20)), x0)
+    assert feasible.all() and replay("FailsNot-v0", x0, u, cost)["replay_error"].max() < 1e-8
+
+
+def test_guesses_that_diverge_are_left_out(new_problem):
+    """x2' = x2^3 + u: at full control along the velocity the state overflows, and with none IPOPT finds the way."""
+    cubed = lambda x, u: (x[1], x[1] ** 3 + u)  # noqa: E731
+    phases = (Phase(steps=20, target=(0.0, 0.0), radius=0.05, R=0.1, Qf=20.0, bonus=20.0),)
+    env_id = new_problem(Problem("Diverges-v0", cubed, 0.1, phases, x_max=(100.0, 50.0)))
+    assert len(list(baselines.guesses(env_id, np.array([0.0, 4.0])))) == 2
+    assert len(list(baselines.guesses(env_id, np.array([0.1, -0.1])))) == 4
+
+
+def test_guesses_are_of_the_start_alone(new_problem):
+    """Whoever is solved beside it."""
+    env_id = new_problem(swing_up("Neighbours-v0", 6, u_max=0.6))
+    x0 = starts(4)
+    together = reference(env_id, x0)
+    for n in (3, 0):
+        alone = reference(env_id, x0[n : n + 1])
+        for key, value in alone.items():
+            np.testing.assert_array_equal(value[0], together[key][n])
+
+
+@pytest.mark.parametrize("in_circles", [False, True])
+@pytest.mark.parametrize("built_in", ["DoubleIntegrator-v0", "VanDerPol-v0", *WAYPOINTS])
+def test_single_optimum_is_a_promise_that_is_kept(new_problem, built_in, in_circles):
+    """More guesses find nothing better for the problems of the paper."""
+    env_id = new_problem(replace(PROBLEMS[built_in], env_id=f"Again-{in_circles}-{built_in}", single_optimum=False))
+    assert len(list(baselines.guesses(built_in, np.ones(2)))) == 1 < len(list(baselines.guesses(env_id, np.ones(2))))
+    x0 = np.vstack([starts(2), [[1.0, 1.0]]])
+    _, one, feasible = optimise(built_in, x0, in_circles=in_circles)
+    _, several, _ = optimise(env_id, x0, in_circles=in_circles)
+    assert feasible.all()
+    np.testing.assert_allclose(several, one, rtol=1e-9)
+
+
+def test_single_phase_of_a_user_has_no_circle(new_problem):
+    """A bonus beyond the cost of hitting changes nothing: as for the paper's problems the optimum is that of J."""
+    phase = Phase(steps=30, target=(1.0, 0.5), radius=0.01, R=1.0, Qf=1.0, bonus=1e3)
+    env_id = new_problem(Problem("User-v0", pendulum, 1.0, (phase,), x_max=(50.0, 50.0)))
+    x0 = starts(3)
+    optimum = reference(env_id, x0)
+    assert not optimum["hit"].any() and not {"constrained", "infeasible"} & optimum.keys()
+    np.testing.assert_allclose(optimum["cost"], optimise(env_id, x0)[1], rtol=1e-9)
+
+
+def test_feedback_about_waypoints_is_the_optimum_where_it_does_not_saturate():
+    x0 = starts(30)
+    flight = fly("DoubleIntegratorWaypoints-v0", lqr_policy(PROBLEMS["DoubleIntegratorWaypoints-v0"]), x0)
+    inside = np.abs(flight["u"]).max(axis=1) < 2.99
+    assert 10 < inside.sum()
+    cost = optimise("DoubleIntegratorWaypoints-v0", x0[inside])[1]
+    np.testing.assert_allclose(flight["cost"][inside], cost, rtol=1e-9)
+
+
+def test_feedback_about_a_target_that_is_not_at_rest(new_problem):
+    """Linear dynamics that drift: x2' = 0.3 - 0.5 x1 + u about (0.4, 0.2)."""
+    drifts = lambda x, u: (x[1], 0.3 - 0.5 * x[0] + u)  # noqa: E731
+    phase = Phase(steps=40, target=(0.4, 0.2), radius=0.05, R=0.5, Qf=5.0, bonus=1.0, Q=(1.0, 0.2))
+    env_id = new_problem(Problem("Drifts-v0", drifts, 50.0, (phase,), x_max=(50.0, 50.0)))
+    x0 = starts(5)
+    np.testing.assert_allclose(
+        fly(env_id, lqr_policy(PROBLEMS[env_id]), x0)["cost"], optimise(env_id, x0)[1], rtol=1e-9
+    )
+
+
+def test_dynamics_that_take_no_complex_number_are_differenced():
+    angle = replace(VAN_DER_POL, f=lambda x, u: (x[1], np.arctan2(x[0], 1.0) + u))
+    exact = replace(VAN_DER_POL, f=lambda x, u: (x[1], np.arctan(x[0]) + u))
+    for got, expected in zip(baselines.linearise(angle, (0.3, 0.1)), baselines.linearise(exact, (0.3, 0.1))):
+        np.testing.assert_allclose(got, expected, rtol=0, atol=1e-9)
+
+
+def test_numpy_functions_in_the_dynamics_do_not_warn():
+    code = """
+import numpy as np
+import baselines, envs
+pendulum = lambda x, u: (x[1], np.sin(x[0]) - np.exp(x[1]) * np.tanh(x[1]) + np.sqrt(1 + x[0] ** 2) * u)
+problem = envs.replace(envs.VAN_DER_POL, f=pendulum)
+envs.PROBLEMS[problem.env_id] = problem
+print(*baselines.reference(problem.env_id, [[0.5, 0.5]])["replay_error"])
+"""
+    command = [sys.executable, "-W", "error", "-c", code]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert done.stderr == "" and float(done.stdout) < 1e-8
+
+
+@pytest.mark.parametrize("env_id", PROBLEMS)
+def test_every_problem_has_a_reference_that_is_flown(env_id):
+    problem = PROBLEMS[env_id]
+    x0 = baselines.starts(0, 2, problem.x0_max)
+    optimum = reference(env_id, x0)
+    assert KEYS <= set(optimum) and np.isfinite(optimum["cost"]).all()
+    np.testing.assert_array_equal(optimum["x"][:, 0], x0)
+    assert np.abs(optimum["u"]).max() <= problem.u_max
+    nothing = fly(env_id, lambda obs, t: np.zeros((2, 1)), x0)
+    assert (optimum["episodic_return"] >= nothing["episodic_return"]).all()
+
+
 # --- errors -----------------------------------------------------------------------------------------------------------
 
 
@@ -272,6 +407,28 @@ def test_command_writes_what_it_prints(tmp_path, name, env_id, key):
         np.testing.assert_array_equal(arrays["cost_reference"], again["cost"])
     assert numbers["cost_mean"] == pytest.approx(again["cost"].mean())
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.json", "a.npz"]
+
+
+@pytest.mark.parametrize("phases", [1, 2])
+def test_command_of_a_problem_of_a_users_own(new_problem, capsys, phases):
+    """Its id is a sub-command, its starts are from its own box, and it is compared like the paper's of its kind."""
+    column = Phase(steps=20, target=(0.5, 0.0), radius=0.1, R=0.1, Qf=20.0, bonus=20.0)
+    problem = Problem(f"Own{phases}-v0", double_integrator, 5.0, (column,) * phases, (200.0, 90.0), x0_max=2.0)
+    args = baselines.parse_args([new_problem(problem), "--starts", "3", "--seed", "7"])
+    args.run(args)
+    printed = dict(line.split() for line in capsys.readouterr().out.splitlines())
+    assert printed["env_id"] == problem.env_id
+    assert ("lqr_ratio_of_sums" if phases == 1 else "distance_phase_2") in printed
+    x0 = np.random.default_rng(7).uniform(-2, 2, (3, 2))
+    assert float(printed["cost_mean"]) == pytest.approx(reference(problem.env_id, x0)["cost"].mean(), rel=1e-6)
+
+
+def test_every_id_and_every_short_name_is_a_command():
+    short = ["double-integrator", "van-der-pol", "double-integrator-waypoints", "van-der-pol-waypoints"]
+    ids = ["DoubleIntegrator-v0", "VanDerPol-v0", "DoubleIntegratorWaypoints-v0", "VanDerPolWaypoints-v0"]
+    assert [baselines.parse_args([name]).env_id for name in short] == ids
+    assert [baselines.parse_args([env_id]).env_id for env_id in PROBLEMS] == list(PROBLEMS)
+    assert baselines.parse_args(["rocket"]).json is None
 
 
 @pytest.mark.parametrize("arguments, message", [

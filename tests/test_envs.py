@@ -1,7 +1,11 @@
-"""envs.py against the paper's tables (typed once more here), exact discretisation, SciPy's integrator, and itself."""
+"""envs.py against the paper's tables (typed once more here), exact discretisation, SciPy's integrator, and itself.
+
+What holds for every problem is asked of every one in `PROBLEMS`: also that `x_max` bounds what can be reached.
+"""
 
 import math
 import warnings
+from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
@@ -32,7 +36,16 @@ PAPER = {
     ),
 }
 IDS = list(PAPER)
-WAYPOINT_IDS = [env_id for env_id in IDS if "Waypoints" in env_id]
+
+
+def columns(problem):
+    """The table of another problem, whose numbers are its own."""
+    names = ("steps", "target", "radius", "R", "Qf", "bonus")
+    return problem.u_max, [tuple(getattr(phase, name) for name in names) for phase in problem.phases]
+
+
+TABLES = {env_id: PAPER[env_id] if env_id in PAPER else columns(problem) for env_id, problem in PROBLEMS.items()}
+WAYPOINT_IDS = [env_id for env_id in TABLES if len(TABLES[env_id][1]) > 1]
 CORNERS = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
 
 
@@ -58,12 +71,12 @@ def paper_episode(env_id, x, u):
 
 
 def horizon(env_id):
-    return sum(phase[0] for phase in PAPER[env_id][1])
+    return sum(phase[0] for phase in TABLES[env_id][1])
 
 
 def random_actions(env_id, num_envs, seed=0):
     """Actions (T, N, 1), a third of them beyond the bound."""
-    u_max = PAPER[env_id][0]
+    u_max = TABLES[env_id][0]
     return np.random.default_rng(seed).uniform(-1.5 * u_max, 1.5 * u_max, (horizon(env_id), num_envs, 1))
 
 
@@ -132,9 +145,9 @@ def test_rewards_are_the_papers(env_id):
     assert flight["hit"].any(axis=0).all() and not flight["hit"].all(axis=0).any(), "both outcomes should occur"
 
 
-@pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.parametrize("env_id", PROBLEMS)
 def test_fly_records_states_and_applied_controls(env_id):
-    u_max, x0 = PAPER[env_id][0], CORNERS
+    u_max, x0 = TABLES[env_id][0], CORNERS
     actions = random_actions(env_id, 4)
     flight = fly(env_id, lambda obs, t: actions[t], x0)
     np.testing.assert_array_equal(flight["x"][:, 0], x0)
@@ -222,7 +235,7 @@ def test_waypoint_observation(env_id, target, phi):
     np.testing.assert_array_equal(obs[:, 5], phi)
 
 
-@pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.parametrize("env_id", PROBLEMS)
 def test_hidden_phase_reads_zero(env_id):
     shown, hidden = observations(env_id)[0], observations(env_id, observe_phase=False)[0]
     clock = slice(-2, None) if env_id in WAYPOINT_IDS else slice(-1, None)
@@ -231,9 +244,9 @@ def test_hidden_phase_reads_zero(env_id):
     np.testing.assert_array_equal(hidden, shown)
 
 
-@pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.parametrize("env_id", PROBLEMS)
 def test_observation_space_contains_what_the_worst_controls_reach(env_id):
-    u_max, envs = PAPER[env_id][0], gym.make_vec(env_id, num_envs=4)
+    u_max, envs = TABLES[env_id][0], gym.make_vec(env_id, num_envs=4)
     space = envs.single_observation_space
     assert np.isfinite(space.low).all() and np.isfinite(space.high).all()
     assert space.shape[0] == (6 if env_id in WAYPOINT_IDS else 3) and space.dtype == np.float64
@@ -243,7 +256,7 @@ def test_observation_space_contains_what_the_worst_controls_reach(env_id):
         "pump": lambda obs: u_max * np.where(obs[:, 1:2] >= 0, 1.0, -1.0),  # along the velocity: adds most energy
     }
     for name, push in pushes.items():
-        obs = envs.reset(options={"x0": CORNERS})[0]
+        obs = envs.reset(options={"x0": PROBLEMS[env_id].x0_max * CORNERS})[0]
         for _ in range(horizon(env_id)):
             assert all(space.contains(row) for row in obs), (name, obs)
             obs, _, _, _, info = envs.step(push(obs))
@@ -253,7 +266,7 @@ def test_observation_space_contains_what_the_worst_controls_reach(env_id):
 # --- the gymnasium interface ------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.parametrize("env_id", PROBLEMS)
 def test_check_env(env_id):
     env = gym.make(env_id)
     assert env.spec.max_episode_steps is None
@@ -264,10 +277,18 @@ def test_check_env(env_id):
     assert not unexpected
 
 
-@pytest.mark.parametrize("env_id", IDS)
+def test_waypoints_at_rest_have_a_box_with_a_width(new_problem):
+    """All velocities 0: Gymnasium warns of bounds that are equal."""
+    phases = tuple(replace(phase, target=(phase.target[0], 0.0)) for phase in PROBLEMS["VanDerPolWaypoints-v0"].phases)
+    env_id = new_problem(replace(PROBLEMS["VanDerPolWaypoints-v0"], env_id="AtRest-v0", phases=phases))
+    space = gym.make_vec(env_id, num_envs=1).single_observation_space
+    assert (space.low[:4] < space.high[:4]).all() and space.high[2] == 0.5
+
+
+@pytest.mark.parametrize("env_id", PROBLEMS)
 def test_vector_environment_is_native(env_id):
     envs = gym.make_vec(env_id, num_envs=5)
-    u_max = PAPER[env_id][0]
+    u_max = TABLES[env_id][0]
     assert isinstance(envs.unwrapped, PhasedVectorEnv)
     assert envs.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
     assert (envs.single_action_space.low, envs.single_action_space.high) == (-u_max, u_max)
@@ -275,7 +296,7 @@ def test_vector_environment_is_native(env_id):
     assert envs.observation_space.contains(obs) and obs.dtype == np.float64
 
 
-@pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.parametrize("env_id", PROBLEMS)
 def test_single_environment_is_the_vector_environment(env_id):
     starts, actions = np.random.default_rng(6).uniform(-1, 1, (3, 2)), random_actions(env_id, 3)
     envs, singles = gym.make_vec(env_id, num_envs=3), [gym.make(env_id) for _ in range(3)]
@@ -295,7 +316,7 @@ def test_single_environment_is_the_vector_environment(env_id):
     assert terminated.all() and not truncated.any()
 
 
-@pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.parametrize("env_id", PROBLEMS)
 def test_steps_outside_an_episode_are_refused(env_id):
     """Before the first reset, after the end, after a refused reset; a refused action ends nothing."""
     env = gym.make(env_id, disable_env_checker=True).unwrapped  # Gymnasium's wrapper refuses the first step by itself
@@ -318,7 +339,7 @@ def test_steps_outside_an_episode_are_refused(env_id):
         env.step(action)
 
 
-@pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.parametrize("env_id", PROBLEMS)
 def test_row_of_a_large_batch_is_a_batch_of_one(env_id):
     starts, actions = np.random.default_rng(7).uniform(-1, 1, (1000, 2)), random_actions(env_id, 1000)
     large = fly(env_id, lambda obs, t: actions[t], starts)
@@ -328,7 +349,7 @@ def test_row_of_a_large_batch_is_a_batch_of_one(env_id):
             np.testing.assert_array_equal(value[0], large[key][n])
 
 
-@pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.parametrize("env_id", PROBLEMS)
 def test_autoreset_in_the_same_step(env_id):
     envs, actions = gym.make_vec(env_id, num_envs=2), random_actions(env_id, 2)
     envs.reset(seed=0, options={"x0": CORNERS[:2]})
@@ -342,11 +363,11 @@ def test_autoreset_in_the_same_step(env_id):
     np.testing.assert_array_equal(info["final_obs"][:, :2], flight["x"][:, -1])
     for key in ("episodic_return", "cost", "cost_state", "cost_control", "cost_terminal", "hit", "terminal_error"):
         np.testing.assert_array_equal(info["final_info"][key], flight[key])
-    assert (np.abs(obs[:, :2]) <= 1).all() and not np.array_equal(obs[0, :2], obs[1, :2])
+    assert (np.abs(obs[:, :2]) <= PROBLEMS[env_id].x0_max).all() and not np.array_equal(obs[0, :2], obs[1, :2])
     assert (obs[:, 4 if env_id in WAYPOINT_IDS else 2] == 0).all()
 
 
-@pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.parametrize("env_id", PROBLEMS)
 def test_autoreset_of_a_batch_out_of_phase(env_id):
     """Environment 1 starts two steps before its end: it must restart alone, and its next episode count from zero."""
     T, envs = horizon(env_id), gym.make_vec(env_id, num_envs=2)
@@ -378,7 +399,7 @@ def test_autoreset_of_a_batch_out_of_phase(env_id):
 # --- starts and bad input ---------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.parametrize("env_id", PROBLEMS)
 def test_starts_follow_the_seed(env_id):
     def first_starts(seed):
         envs = gym.make_vec(env_id, num_envs=1000)
@@ -388,13 +409,14 @@ def test_starts_follow_the_seed(env_id):
     for got, expected in zip(first_starts(1), (starts, next_starts)):
         np.testing.assert_array_equal(got, expected)
     assert not np.array_equal(first_starts(2)[0], starts) and not np.array_equal(next_starts, starts)
+    starts = starts / PROBLEMS[env_id].x0_max
     assert np.abs(starts).max() <= 1 and np.abs(starts).max(axis=0).min() > 0.95
     np.testing.assert_allclose(starts.mean(axis=0), 0, atol=0.1)
     single, batch = gym.make(env_id).reset(seed=1)[0], gym.make_vec(env_id, num_envs=1).reset(seed=1)[0]
     np.testing.assert_array_equal(single, batch[0])
 
 
-@pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.parametrize("env_id", PROBLEMS)
 @pytest.mark.parametrize("num_envs, group, groups", [(6, 1, 6), (6, 2, 3), (6, 6, 1), (7, 3, 3), (2, 5, 1)])
 def test_flights_per_start(env_id, num_envs, group, groups):
     """Environment k flies start k // G: the draws of a smaller batch, each G times, at a reset and at the autoreset."""
@@ -422,7 +444,7 @@ def test_bad_flights_per_start_are_refused(group):
         envs.reset()
 
 
-@pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.parametrize("env_id", PROBLEMS)
 def test_starts_outside_the_box_are_allowed(env_id):
     start = [[3.0, -2.0], [0.0, 5.0]]
     np.testing.assert_array_equal(gym.make_vec(env_id, num_envs=2).reset(options={"x0": start})[0][:, :2], start)
@@ -436,7 +458,7 @@ def test_bad_starts_are_refused(x0):
         gym.make_vec("VanDerPol-v0", num_envs=2).reset(options={"x0": x0})
 
 
-@pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.parametrize("env_id", PROBLEMS)
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_bad_actions_name_environment_and_step(env_id, value):
     envs = gym.make_vec(env_id, num_envs=4)

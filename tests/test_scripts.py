@@ -25,16 +25,20 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import animation
+import envs
 import runs
 
 torch.set_num_threads(1)
 ROOT = Path(__file__).parent.parent
 SCRIPTS = sorted(ROOT.glob("ppo_gtrxl_*.py"))
-DI, VDP, ROCKET = (importlib.import_module(f"ppo_gtrxl_{name}") for name in ("di", "vdp", "rocket"))
+MODULES = [importlib.import_module(path.stem) for path in SCRIPTS]
+DI, VDP, ROCKET = (importlib.import_module(f"ppo_gtrxl_{name}") for name in ("di", "vdp", "rocket"))  # the paper's
 STEPS = {"DoubleIntegrator-v0": 50, "DoubleIntegratorWaypoints-v0": 100}  # of an episode
 STEPS |= {"VanDerPol-v0": 70, "VanDerPolWaypoints-v0": 140}
 STEPS |= {"RocketAscent-v0": 481, "RocketAscentCutoff-v0": 481}
-CASES = [(script, env_id) for script in (DI, VDP, ROCKET) for env_id in script.ENV_IDS]
+SHIPPED = set(STEPS)
+STEPS = {env_id: problem.steps for env_id, problem in envs.PROBLEMS.items()} | STEPS
+CASES = [(script, env_id) for script in MODULES for env_id in script.ENV_IDS]
 NETWORK = ["--embed-dim=8", "--num-heads=2", "--num-blocks=1", "--memory-length=4", "--mlp-dim=8", "--hidden-dim=8"]
 TINY = [*NETWORK, "--num-envs=2", "--num-minibatches=2", "--update-epochs=2", "--eval-starts=10"]
 
@@ -195,7 +199,7 @@ def test_flags_of_the_interface():
         " num_threads torch_compile noise log_std_final gae_lambda_final lr_schedule memory_noise flights_per_start"
     )
     words += " refine_from log_std_refine"
-    fields = {s: {field.name for field in dataclasses.fields(s.Args)} for s in (DI, VDP, ROCKET)}
+    fields = {script: {field.name for field in dataclasses.fields(script.Args)} for script in MODULES}
     assert all(set(words.split()) <= fields[script] | {"radius_curriculum"} for script in fields)
     assert not {"return_norm", "noise_decay", "target_kl_final"} & fields[DI]
     rocket_only = {"action_frame", "guidance", "mass_weight"}
@@ -236,6 +240,8 @@ def test_smoke_run_is_short(smoke):
     """15 s on a free core; CPU time is counted, with room for a core that is shared."""
     *_, env_id, _, seconds = smoke
     print(f"{env_id}: {seconds:.1f} s of CPU time")
+    if env_id not in SHIPPED:
+        pytest.skip("how long its optima take is not known")
     assert seconds < 22
 
 
@@ -248,7 +254,7 @@ def test_smoke_run_writes_what_the_interface_names(smoke):
     assert len(events) == 1 and names - events == RUN_FILES
     assert os.listdir(folder) == ["runs"]
     metrics = json.loads((run / "eval.json").read_text())
-    rocket = script is ROCKET
+    rocket = env_id in envs.ROCKETS
     assert set(COMMON_KEYS.split()) | set((ROCKET_KEYS if rocket else PHASED_KEYS).split()) <= metrics.keys()
     assert (metrics["env_id"], metrics["seed"], metrics["eval_seed"]) == (env_id, 1, 0)
     assert metrics["eval_starts"] == (1 if rocket else 50)  # a rocket has one start
@@ -270,7 +276,7 @@ def test_smoke_run_logs_the_tags(smoke):
         assert step == updates[-1] and shown == pytest.approx(float(value), rel=1e-6), tag
     rates = [value for _, value in logged["charts/learning_rate"]]
     first, last = script.Args().learning_rate, script.Args().learning_rate_final
-    if script is ROCKET:  # it follows the noise, which may have fallen after the first update
+    if script.Args().lr_schedule == "std":  # it follows the noise, which may have fallen after the first update
         first *= np.exp(script.Args().log_std)
         last = rates[1] if rates[1] <= rates[0] else 0.0
     assert rates == pytest.approx([first, last], rel=1e-6)
@@ -886,6 +892,33 @@ def test_tracking_without_wandb_says_how_to_install_it(refuses, monkeypatch):
     assert "pip install wandb" in refuses("--track")
 
 
+@pytest.mark.parametrize(
+    "scale, line",
+    [
+        ([1.0] * 5, "holds 5; must hold 6 numbers, one for each of its observations"),
+        ([1.0] * 7, "holds 7; must hold 6 numbers"),
+        ([1.0], "holds 1; must hold 6 numbers"),
+        ([1.0] * 5 + [0.0], r"is \[1.0, .*, 0.0\]; must be finite, without 0"),
+        ([1.0] * 5 + [np.nan], r"is \[1.0, .*, nan\]; must be finite, without 0"),
+    ],
+)
+def test_scale_that_does_not_fit_the_observations(scale, line):
+    """A slip in a script's BUFFERS, before anything is learned or written."""
+    env_id = "VanDerPolWaypoints-v0"
+    buffers = {**VDP.BUFFERS, env_id: {"observation_scale": scale}}
+    with pytest.raises(SystemExit) as stop:
+        runs.parse_args(VDP.Args, ["--env-id", env_id], VDP.ENV_OPTIONS, buffers)
+    name = r"error: BUFFERS of ppo_gtrxl_vdp.py: observation_scale of VanDerPolWaypoints-v0 "
+    assert re.match(name + line, stop.value.code) and "\n" not in stop.value.code
+
+
+def test_id_that_no_environment_has():
+    """A script's id whose line in PROBLEMS is missing."""
+    buffers = {**DI.BUFFERS, "Forgotten-v0": {"observation_scale": [1.0] * 3}}
+    with pytest.raises(SystemExit, match="error: --env-id Forgotten-v0: .* envs.PROBLEMS must have it"):
+        runs.parse_args(DI.Args, ["--env-id=Forgotten-v0"], DI.ENV_OPTIONS, buffers)
+
+
 def test_minibatches_left_alone_are_lowered(capsys):
     default = DI.Args().num_minibatches
     args = parse("--num-envs", "2")
@@ -1003,9 +1036,31 @@ def test_checkpoint_with_impossible_counters(refuses, trained, tmp_path, value):
     assert f"--checkpoint {path}: " in refuses(*argv, "--checkpoint", path)
 
 
-def test_checkpoint_of_the_other_script(refuses, trained):
-    message = refuses("--eval-only", "--checkpoint", trained / "agent.safetensors", script=VDP)
-    assert "DoubleIntegrator-v0" in message and all(known in message for known in VDP.ENV_IDS)
+@pytest.mark.parametrize("script", MODULES, ids=lambda script: script.__name__)
+def test_checkpoint_of_another_script(refuses, trained, tmp_path, script):
+    """Its environment is named and the script's are, whatever else the file lacks of this script's arguments."""
+    for other in MODULES:
+        if set(other.ENV_IDS) & set(script.ENV_IDS):
+            continue
+        env_id = other.ENV_IDS[-1]
+        path = edited_checkpoint(trained, tmp_path / "agent", args={"env_id": env_id})
+        for flags in ([], [f"--env-id={script.ENV_IDS[0]}"]):
+            message = refuses("--eval-only", "--checkpoint", path, *flags, script=script)
+            assert (
+                message == f"error: --checkpoint {path}: is of {env_id}; this script takes {', '.join(script.ENV_IDS)}"
+            )
+
+
+def test_checkpoint_of_other_buffers_and_sizes(refuses, trained, tmp_path):
+    """What does not fit is named with both shapes."""
+    for tensors, shapes in [
+        ({"observation_scale": torch.ones(6)}, r"observation_scale is \(6,\) in the file and \(3,\) in this script"),
+        ({"encoder.0.weight": torch.ones(8, 6)}, r"encoder.0.weight is \(8, 6\) in the file and \(8, 3\) in this "),
+        ({"units": torch.ones(2)}, r"units is \(2,\) in the file and missing in this script"),
+    ]:
+        path = edited_checkpoint(trained, tmp_path / "agent", tensors)
+        message = refuses("--eval-only", "--checkpoint", path)
+        assert re.search(f"--checkpoint {path}: does not fit its own args, BUFFERS or features .{shapes}", message)
 
 
 @pytest.mark.parametrize(
@@ -1066,6 +1121,18 @@ def test_resume_of_what_is_no_run(refuses, trained, tmp_path, kind):
     message = refuses("--resume", tmp_path / "run")
     assert f"--resume {tmp_path / 'run'}: " in message and "training_state.pt" in message
     assert not Path("executed").exists()
+
+
+@pytest.mark.parametrize(
+    "kind, reason",
+    [
+        ("of another problem", "it is of VanDerPol-v0; this script takes DoubleIntegrator-v0, DoubleIntegratorWay"),
+        ("of another version", "old_flag is not among the arguments of both"),
+    ],
+)
+def test_resume_of_another_script_says_so(refuses, trained, tmp_path, kind, reason):
+    foreign_state(kind, trained, tmp_path / "run")
+    assert reason in refuses("--resume", tmp_path / "run")
 
 
 def test_resume_of_a_missing_folder(refuses):
