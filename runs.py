@@ -30,6 +30,7 @@ import torch.distributed as dist
 import tyro
 
 import evaluate
+from baselines import NoOptimum
 
 gc.freeze()  # what was imported is never garbage; looking through it took a fifth of the time of --help
 
@@ -220,7 +221,7 @@ def start(main):
         signal.signal(signum, interrupt)
     try:
         main(sys.argv[1:])
-    except (evaluate.BadInput, OSError) as error:
+    except (evaluate.BadInput, NoOptimum, OSError) as error:
         fail(error)
     except KeyboardInterrupt as error:
         sys.exit(*error.args)
@@ -313,6 +314,7 @@ class Run:
         self.state = training_state(self.args, self.modules, self.envs, self.progress)
         if self.rank > 0:
             return self
+        self.solve_reference()
         self.folder = self.folder or new_folder(f"{self.args.env_id}__{self.args.exp_name}__{self.args.seed}")
         print(f"run folder: {self.folder}", flush=True)
         for leftover in self.folder.glob(".*.tmp"):  # of a writer that was killed
@@ -325,6 +327,11 @@ class Run:
         self.save()
         self.update_began = time.time()
         return self
+
+    def solve_reference(self):
+        """The optimum that evaluations fly, before anything is learned: an orbit out of reach is said at once."""
+        seed = TRAINING_EVAL_SEED if self.args.eval_every else self.args.eval_seed
+        evaluate.optimum(self.args.env_id, seed, self.args.eval_starts)
 
     def __exit__(self, kind, error, traceback):
         if self.writer:
