@@ -333,7 +333,7 @@ def state_scale(rocket: Rocket):
 def collocation_mesh(case: Ascent, end: float, segments: int) -> Mesh:
     """About `segments` intervals of like length, a whole number in each arc; the last arc's stretch with the end."""
     arcs = [arc for arc in case.rocket.arcs() if arc[0] < end]
-    start, stop = arcs[-1][:2]
+    start, stop = arcs[-1][0], min(arcs[-1][1], case.rocket.end_time)
     ends = [min(arc[1], end) for arc in arcs]
     pieces = [np.linspace(a[0], b, max(round(segments * (b - a[0]) / end), 1) + 1)[1:] for a, b in zip(arcs, ends)]
     t = np.concatenate([[0.0], *pieces])
@@ -480,9 +480,14 @@ def mission_ascent(key: str, mission: Mission) -> Ascent:
 
 
 def guesses(rocket: Rocket) -> list[tuple[float, float]]:
-    """Final times and times in which to tilt from straight up to the horizon, s each, in the order they are tried."""
-    end = min(900.0, 0.94 * rocket.burns[-1].end)
-    return [(end, min(280.0, 0.5 * end)), (end, 0.3 * end), (end, 0.8 * end), (0.8 * end, 0.4 * end)]
+    """Final times and times in which to tilt from straight up to the horizon, s each, in the order they are tried.
+
+    Each final time is well within the last burn: an optimum is looked for in the arc that its guess ends in.
+    """
+    last = rocket.end_time
+    earliest = min((rocket.last_ignition + last) / 2, last)
+    end = max(min(900.0, 0.94 * last), earliest)
+    return [(end, min(280.0, 0.5 * end)), (end, 0.3 * end), (end, 0.8 * end), (max(0.8 * end, earliest), 0.4 * end)]
 
 
 def pitch_times(rocket: Rocket, end: float):
@@ -610,7 +615,9 @@ def rocket_reference(env_id: str, **options) -> dict:
     if env_id not in ROCKETS:
         raise ValueError(f"env_id is {env_id!r}; it must be one of {', '.join(ROCKETS)}")
     mission, key = envs.flown_mission(ROCKETS[env_id], **options), STORED.get(env_id, env_id)
-    rocket = mission.rocket
+    rocket, case = mission.rocket, mission_ascent(key, mission)
+    if case != ASCENTS.get(key, case):  # the id, but neither the paper's rocket nor its ceiling
+        key, case = env_id, case._replace(key=env_id)
     try:
         numbers, u, end = stored_ascent(key)
         flight = fly_directions(env_id, rocket, u, end)
@@ -618,7 +625,7 @@ def rocket_reference(env_id: str, **options) -> dict:
     except (OSError, EOFError, LookupError, TypeError, ValueError, BadZipFile):
         stale = True
     if stale or mission != ROCKETS[env_id]:
-        numbers, flight, _ = solve_ascent(mission_ascent(key, mission))
+        numbers, flight, _ = solve_ascent(case)
         flight = fly_directions(env_id, rocket, flight["u"], flight["t"][-1])
     opponent = nine_pitch_angles(env_id, flight, rocket)["error_norm"]
     mass, end_time = numbers["final_mass_kg"], numbers["final_time_s"]
