@@ -1,7 +1,7 @@
 """The rockets' problems typed once more and integrated by SciPy: what the rocket's tests measure the code against.
 
 The numbers of the paper's rocket are the benchmark's, those of the second vehicle are its file's, both typed here.
-Nothing of the project is imported but what flies: `make` and `single`.
+Nothing of the project is imported but what flies: `make`, `single`, and a vehicle of one burn.
 """
 
 import math
@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from envs import ROCKETS, RocketEnv, RocketVectorEnv
+from envs import ROCKETS, Burn, Engine, Rocket, RocketEnv, RocketVectorEnv, launch_raan
 
 MU, RE, OMEGA, SEA_LEVEL_G = 3.986012e14, 6378145.0, 7.29211585e-5, 9.80665
 FIXED, CUTOFF, LEO = "RocketAscent-v0", "RocketAscentCutoff-v0", "TwoStageLEO-v0"
@@ -220,3 +220,10 @@ def assert_states_agree(got, expected, relative=1e-6):
     for part in (slice(0, 3), slice(3, 6), slice(6, 7)):
         miss = np.linalg.norm(got[..., part] - expected[..., part], axis=-1)
         np.testing.assert_array_less(miss, relative * np.linalg.norm(expected[..., part], axis=-1))
+
+
+def single_burn(**changes):
+    """One stage of 36.5 t of propellant and 2.5 t dry for 1 t to a low circle; no staging, no phase but the last."""
+    stage = Engine(total_mass=39e3, propellant=36.5e3, thrust=640e3, isp=450.0, burn_time=250.0)
+    options = {"burns": (Burn(250.0, ((1, stage),)),), "payload": 1e3, "end_time": 250.0, "a": 6.6e6, "e": 0.0}
+    return Rocket(**options | {"i": 40.0, "raan": launch_raan(28.5, 40.0), "argp": 0.0, "S": 5.0} | changes)
