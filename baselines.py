@@ -467,7 +467,8 @@ def ascend(case: Ascent, mesh: Mesh, guess: dict) -> dict:
 FIXED, CUTOFF = "RocketAscent-v0", "RocketAscentCutoff-v0"
 STORED = {CUTOFF: "free", FIXED: "fixed_capped"}  # the keys of the paper's references; any other's is its id
 RESULTS = Path(__file__).parent / "results"
-MISS_TOLERANCE = 2e-5  # terminal error of a reference in flight
+MISS_TOLERANCE = 2e-5  # terminal error of a stored reference in flight, unless it flew worse when it was solved
+HELD_TOLERANCE = 2e-4  # of a solve's: directions held over steps cost more where a rocket accelerates harder
 IN_PLANE = 1e-3  # rad, below which an optimum's yaw is the solver's rounding
 
 
@@ -580,7 +581,7 @@ def solve_ascent(case: Ascent):
     """One ascent: its numbers, its flight by the environment, and the collocation (None if the time is fixed).
 
     With free final time the collocation's directions at mid-step are held over the environment's steps; with fixed time
-    the program has these steps itself. Raises RuntimeError where the flight misses by more than `MISS_TOLERANCE`.
+    the program has these steps itself. Raises RuntimeError where the flight misses by more than `HELD_TOLERANCE`.
     """
     from scipy.interpolate import CubicSpline
 
@@ -594,7 +595,7 @@ def solve_ascent(case: Ascent):
         directions = solution["u"]
     seconds = time.perf_counter() - begin
     flight = fly_directions(FIXED, rocket, directions, solution["final_time"])
-    if not flight["error_norm"] <= MISS_TOLERANCE:
+    if not flight["error_norm"] <= HELD_TOLERANCE:
         raise RuntimeError(f"rocket ascent {case.key}: flown by the environment it misses by {flight['error_norm']}")
     numbers = {"final_mass_kg": solution["final_mass"], "final_time_s": solution["final_time"]}
     numbers |= {"error_norm": np.linalg.norm(envs.terminal_error(solution["y"][-1], rocket))}
@@ -621,7 +622,7 @@ def rocket_reference(env_id: str, **options) -> dict:
     try:
         numbers, u, end = stored_ascent(key)
         flight = fly_directions(env_id, rocket, u, end)
-        stale = not flight["error_norm"] <= MISS_TOLERANCE
+        stale = not flight["error_norm"] <= max(MISS_TOLERANCE, 1.01 * numbers["replay_error_norm"])
     except (OSError, EOFError, LookupError, TypeError, ValueError, BadZipFile):
         stale = True
     if stale or mission != ROCKETS[env_id]:
@@ -635,7 +636,7 @@ def rocket_reference(env_id: str, **options) -> dict:
 def stored_ascent(key: str):
     """The numbers, directions (K, 3) and final time (s) of a solve in results/; many errors where it cannot be read."""
     numbers = json.loads((RESULTS / "rocket_reference.json").read_text())[key]
-    numbers = {name: float(numbers[name]) for name in ("final_mass_kg", "final_time_s")}
+    numbers = {name: float(numbers[name]) for name in ("final_mass_kg", "final_time_s", "replay_error_norm")}
     with np.load(RESULTS / "rocket_reference.npz") as arrays:
         return numbers, arrays[f"{key}_u"], arrays[f"{key}_t"][-1]
 
