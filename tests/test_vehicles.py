@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 import warnings
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,15 +28,23 @@ TWO = ROCKETS[LEO].rocket
 FIRST, SECOND = (burn.engines[0][1] for burn in TWO.burns)
 
 
+@contextmanager
+def restored():
+    """What is registered within is gone after it, and what it replaced is back."""
+    missions, specs = dict(ROCKETS), dict(gym.registry)
+    try:
+        yield
+    finally:
+        for registry, before in ((ROCKETS, missions), (gym.registry, specs)):
+            registry.clear()
+            registry.update(before)
+        evaluate.optimum.cache_clear()
+
+
 @pytest.fixture(autouse=True)
 def own_registry():
-    """What a test registers is gone after it, and what it replaced is back."""
-    missions, specs = dict(ROCKETS), dict(gym.registry)
-    yield
-    for registry, before in ((ROCKETS, missions), (gym.registry, specs)):
-        registry.clear()
-        registry.update(before)
-    evaluate.optimum.cache_clear()
+    with restored():
+        yield
 
 
 # --- refusals ---------------------------------------------------------------------------------------------------------
@@ -213,13 +222,14 @@ def three_burns(**changes):
 def solved():
     """The optima of two rockets, flown and evaluated: id -> (metrics, arrays, mission)."""
     found = {}
-    for env_id, rocket in {"Single-v0": single_burn(), "ThreeBurns-v0": three_burns()}.items():
-        mission = envs.Mission(rocket, cutoff=True, ceiling_km=400.0 if env_id == "ThreeBurns-v0" else None)
-        register_rocket(env_id, rocket, mission.cutoff, mission.ceiling_km)
-        reference = baselines.rocket_reference(env_id)
-        u = reference["u"]
-        metrics, arrays = evaluate.evaluate(env_id, lambda obs, t, u=u: u[t : t + 1], 0, 1, reference)
-        found[env_id] = metrics, arrays, mission
+    with restored():
+        for env_id, rocket in {"Single-v0": single_burn(), "ThreeBurns-v0": three_burns()}.items():
+            mission = envs.Mission(rocket, cutoff=True, ceiling_km=400.0 if env_id == "ThreeBurns-v0" else None)
+            register_rocket(env_id, rocket, mission.cutoff, mission.ceiling_km)
+            reference = baselines.rocket_reference(env_id)
+            u = reference["u"]
+            metrics, arrays = evaluate.evaluate(env_id, lambda obs, t, u=u: u[t : t + 1], 0, 1, reference)
+            found[env_id] = metrics, arrays, mission
     return found
 
 
@@ -273,15 +283,20 @@ def test_figures_of_a_rocket_of_your_own(solved, env_id):
     assert np.hypot(*(site - [0, rocket.latitude]).T).min() < 0.5
 
 
+def stub(env_id, rocket):
+    """Metrics and arrays of a flight of a rocket registered here, as its own reference."""
+    register_rocket(env_id, rocket)
+    flight = envs.fly_rocket(env_id, lambda obs, t: np.array([[1.0, 0.2, 0.0]]), action_frame="local")
+    reference = flight | {"reference_mass_kg": 1.0, "reference_time_s": 1.0, "nine_pitch_error_norm": 1.0}
+    metrics = {"env_id": env_id} | evaluate.rocket_metrics(flight, reference, ROCKETS[env_id])
+    return metrics, {f"{key}{side}": flight[key] for key in "tuy" for side in ("", "_reference")}
+
+
 def test_late_staging_labels_stay_inside():
     """A last stage of 20 s: its label stands to the left of the line."""
     last = replace(SECOND, burn_time=20.0, propellant=5e3)
     rocket = replace(TWO, burns=(TWO.burns[0], Burn(182.0, ((1, last),))), end_time=182.0)
-    register_rocket("Late-v0", rocket)
-    flight = envs.fly_rocket("Late-v0", lambda obs, t: np.array([[1.0, 0.2, 0.0]]), action_frame="local")
-    reference = flight | {"reference_mass_kg": 1.0, "reference_time_s": 1.0, "nine_pitch_error_norm": 1.0}
-    metrics = {"env_id": "Late-v0"} | evaluate.rocket_metrics(flight, reference, ROCKETS["Late-v0"])
-    arrays = {f"{key}{side}": flight[key] for key in "tuy" for side in ("", "_reference")}
+    metrics, arrays = stub("Late-v0", rocket)
     figure = figures.draw_ascent(arrays, metrics)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
@@ -289,6 +304,17 @@ def test_late_staging_labels_stay_inside():
     (text,) = panel.texts
     inner, outer = text.get_window_extent(canvas.get_renderer()), panel.get_window_extent()
     assert outer.x0 <= inner.x0 and inner.x1 <= outer.x1 and "162 s: 22.00 t dropped" in text.get_text()
+
+
+@pytest.mark.parametrize("a, e", [(4.2e7, 0.0), (3e7, 0.5), (6.6e6, 0.0)])
+def test_orbit_figure_holds_the_whole_target_orbit(a, e):
+    """Also where its perigee is far above the Earth."""
+    metrics, arrays = stub("High-v0", replace(TWO, a=a, e=e))
+    plane = figures.draw_orbit(arrays, metrics).axes[0]
+    (west, east), (south, north) = plane.get_xlim(), plane.get_ylim()
+    b = a * math.sqrt(1 - e * e) / 1e6
+    assert west < -a * (1 + e) / 1e6 and east > a * (1 - e) / 1e6 and south < -b and north > b
+    assert west < -RE / 1e6 and east > RE / 1e6
 
 
 # --- evaluation against the rocket that flies -------------------------------------------------------------------------
@@ -367,3 +393,8 @@ def test_mass_for_an_equatorial_orbit_reached_is_of_its_perigee(monkeypatch):
             with pytest.raises(ZeroDivisionError):
                 evaluate.mass_reached(metrics)
             assert asked[0]["argp_deg"] == pytest.approx(100.0) and asked[0]["raan_deg"] == 300.0
+
+
+def test_the_tests_leave_nothing_registered():
+    assert list(ROCKETS) == [FIXED, CUTOFF, LEO]
+    assert not {"Single-v0", "ThreeBurns-v0", "Again-v0"} & gym.registry.keys()
