@@ -6,9 +6,9 @@
     python baselines.py van-der-pol-waypoints
     python baselines.py rocket --json results/rocket_reference.json --npz results/rocket_reference.npz
 
-Each prints mean costs over random starts and what they are compared with; the rocket has one start and five optima.
-Reading order: linear-quadratic optimum, nonlinear programs, references, the rocket's, command line. CasADi and SciPy
-are imported only where they are used: a training needs neither before its first evaluation.
+Each prints mean costs over random starts and what they are compared with; a rocket has one start, the paper's five
+optima, any other one. Reading order: linear-quadratic optimum, nonlinear programs, references, the rocket's, command
+line. CasADi and SciPy are imported only where they are used: a training needs neither before its first evaluation.
 """
 
 from __future__ import annotations
