@@ -723,7 +723,8 @@ class RocketVectorEnv(BatchedEnv):
         parts[1] = trajectory_reward(self._energy, energy, phase < self._last_phase, self.trajectory_weight)
         if REFERENCE_PITCH[self.guidance] is not None:
             until = self.mission.guided_until or self.rocket.burns[0].end
-            pitch = np.radians(np.interp(self._grid[t] / until, *REFERENCE_PITCH[self.guidance], right=np.nan))
+            times, angles = REFERENCE_PITCH[self.guidance]
+            pitch = np.radians(np.interp(self._grid[t], until * np.array(times), angles, right=np.nan))
             parts[2] = guidance_reward(u, *local_frame(before, self._axes[2])[:2], pitch, self.guidance_weight)
         left = np.minimum(self.y[6] - self.rocket.dry_mass, self._propellant)
         parts[3] = penalties(self.mission, altitude, self.time, turn, burnt, left, self.mass_weight)
@@ -829,14 +830,18 @@ def register_rocket(env_id: str, rocket: Rocket, cutoff: bool = False, ceiling_k
     others = gym.registry.keys() - ROCKETS.keys()
     if env_id in others or not gym.envs.registration.ENV_ID_RE.fullmatch(env_id) or "/" in env_id:
         raise BadInput(f"env_id is {env_id!r}; it must be a new id such as MyRocket-v0")
-    ROCKETS[env_id] = Mission(rocket, cutoff, ceiling_km, **rules)
+    mission = Mission(rocket, cutoff, ceiling_km, **rules)
     gym.registry.pop(env_id, None)
-    gym.register(
-        id=env_id,
-        entry_point=f"{__name__}:make_rocket",
-        vector_entry_point=f"{__name__}:make_rocket_vector",
-        kwargs={"env_id": env_id},
-    )
+    try:
+        gym.register(
+            id=env_id,
+            entry_point=f"{__name__}:make_rocket",
+            vector_entry_point=f"{__name__}:make_rocket_vector",
+            kwargs={"env_id": env_id},
+        )
+    except gym.error.Error as error:  # the name of another environment without its version
+        raise BadInput(f"env_id is {env_id!r}; it must be a new id such as MyRocket-v0: {error}") from error
+    ROCKETS[env_id] = mission
 
 
 def import_vehicles():

@@ -38,8 +38,11 @@ NEAR_ORIGIN = 0.2  # |x0| within which J* is so small that the ratio says little
 
 
 @lru_cache(maxsize=4)  # evaluations during training fly the same starts again and again
-def optimum(env_id: str, eval_seed: int, n: int) -> dict:
-    """`baselines.reference` from the n starts of a seed; of a rocket, which has one start, the flown optimum."""
+def optimum(env_id: str, eval_seed: int, n: int, mission: envs.Mission | None = None) -> dict:
+    """`baselines.reference` from the n starts of a seed; of a rocket, which has one start, the flown optimum.
+
+    A rocket's `mission` only tells apart what an id was registered for before and is now.
+    """
     if env_id in envs.ROCKETS:
         return baselines.rocket_reference(env_id)
     return baselines.reference(env_id, starts(eval_seed, n, envs.PROBLEMS[env_id].x0_max))
@@ -396,7 +399,7 @@ def evaluate_rocket(env_id, policy, eval_seed: int, reference: dict | None = Non
     changed = {name: env_options[name] for name in ("rocket", "table_isp") if name in env_options}
     mission = envs.flown_mission(envs.ROCKETS[env_id], **changed)
     if reference is None:
-        reference = baselines.rocket_reference(env_id, **changed) if changed else optimum(env_id, 0, 1)
+        reference = baselines.rocket_reference(env_id, **changed) if changed else optimum(env_id, 0, 1, mission)
     flight = envs.fly_rocket(env_id, policy, **env_options)
     metrics = {"env_id": env_id, "eval_seed": eval_seed, "eval_starts": 1} | rocket_metrics(flight, reference, mission)
     arrays = {key: flight[key] for key in ("t", "u", "y", "reward")}
@@ -427,8 +430,11 @@ def mass_reached(metrics: dict) -> dict:
     mission = envs.ROCKETS.get(metrics["env_id"])
     if mission is None or not mission.cutoff or not metrics["success"]:
         return {}
+    flight = metrics
+    if mission.rocket.i in EQUATORIAL:  # the metric counts the perigee from the x axis, an element from the node
+        flight = metrics | {"argp_deg": perigee_longitude(-metrics["raan_deg"], metrics["argp_deg"], mission.rocket.i)}
     try:
-        mass = float(baselines.reached_optimum(metrics, mission.rocket)["final_mass"])
+        mass = float(baselines.reached_optimum(flight, mission.rocket)["final_mass"])
     except (ImportError, RuntimeError):
         return {}
     return {"mass_ratio_reached": metrics["final_mass_kg"] / mass, "reference_mass_reached_kg": mass}

@@ -320,7 +320,9 @@ def label_ascent(panels: dict, velocity: list, rocket: envs.Rocket):
         ax.tick_params(axis="y", colors="0.4")
     for k, burn in enumerate(rocket.burns[:-1]):  # the last burn drops nothing
         text, height = f" {burn.end:g} s: {burn.jettison / 1e3:.2f} t dropped", 0.9 - 0.15 * (k % 5)  # of the axes
-        panels["mass"].text(burn.end, height, text, transform=panels["mass"].get_xaxis_transform(), fontsize=9)
+        side = "left" if burn.end <= rocket.end_time / 2 else "right"  # towards the middle: inside the panel
+        where = {"transform": panels["mass"].get_xaxis_transform(), "horizontalalignment": side}
+        panels["mass"].text(burn.end, height, text if side == "left" else f"{text.strip()} ", fontsize=9, **where)
 
 
 def pitch_and_yaw(u: np.ndarray, y: np.ndarray, rocket: envs.Rocket) -> tuple[np.ndarray, np.ndarray]:

@@ -57,6 +57,8 @@ class Engine:
         allowed = f"must be between 0 and its total_mass, {self.total_mass} kg"
         refuse_unless(0 <= self.propellant <= self.total_mass, "an engine's propellant", self.propellant, allowed)
         refuse_unless(self.thrust >= 0, "an engine's thrust", self.thrust, "must not be negative")
+        burns = self.propellant > 0 or self.thrust == 0
+        refuse_unless(burns, "an engine's propellant", self.propellant, "must be positive where it has thrust")
 
     def flow(self, table_isp: bool) -> float:
         """Propellant flow in kg/s: propellant / burn time (the GPOPS-II benchmark's), or T / (g0 Isp) of the table."""
@@ -175,7 +177,7 @@ class Rocket:
         arcs, start = [], 0.0
         for burn in self.burns:
             flow = burn.flow(self.table_isp)
-            dry = start + sum(n * engine.propellant for n, engine in burn.engines) / flow
+            dry = start + sum(n * engine.propellant for n, engine in burn.engines) / flow if flow else np.inf  # a coast
             if burn is self.burns[-1] and dry < burn.end - 1e-6:  # rounding alone is not an event
                 arcs.append((start, dry, burn.thrust, flow, 0.0))
                 start, flow = dry, 0.0
@@ -213,6 +215,7 @@ def check_rocket(rocket: Rocket):
 
 def check_burns(rocket: Rocket):
     """BadInput where the burns are not in order, burn what is not aboard, or longer than their propellant lasts."""
+    refuse_unless(isinstance(rocket.burns, tuple), "a rocket's burns", rocket.burns, "must be a tuple")
     refuse_unless(rocket.burns, "a rocket's burns", rocket.burns, "must hold at least one burn")
     start, used = 0.0, {}
     for k, burn in enumerate(rocket.burns):
@@ -291,7 +294,9 @@ def launch_raan(latitude: float, i: float) -> float:
     The site's longitude is 0 (ours), so that RAAN = -arcsin(tan latitude / tan i), for a launch towards the north. A
     target in another plane costs propellant: 1 degree at 7.7 km/s about 130 m/s times sin i.
     """
-    return float(np.degrees(-np.arcsin(np.clip(np.tan(np.radians(latitude)) / np.tan(np.radians(i)), -1, 1))) % 360)
+    with np.errstate(divide="ignore", invalid="ignore"):  # i = 0; from the equator every node will do
+        ratio = np.nan_to_num(np.tan(np.radians(latitude)) / np.tan(np.radians(i)), nan=0.0)
+    return float(np.degrees(-np.arcsin(np.clip(ratio, -1, 1))) % 360)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -432,7 +437,7 @@ def trajectory_reward(energy, next_energy, early, weight):
 REFERENCE_PITCH = {  # degrees above the horizon over time, as a part of a mission's `guided_until`; our own guess
     "none": None,
     "linear": ((0.0, 1.0), (90.0, 40.0)),
-    "knots": ((0.0, 0.0665, 0.266, 0.5, 1.0), (90.0, 88.0, 72.0, 55.0, 35.0)),
+    "knots": ((0.0, 10 / 150.4, 40 / 150.4, 0.5, 1.0), (90.0, 88.0, 72.0, 55.0, 35.0)),  # s of the paper's rocket
 }
 
 

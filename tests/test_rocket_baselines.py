@@ -1,6 +1,7 @@
 """The rocket's optima in baselines.py against published numbers, the maximum principle and their flights."""
 
 import json
+import re
 import subprocess
 import sys
 from argparse import Namespace
@@ -9,15 +10,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rocket_oracle import single_burn
 
 import baselines
-from baselines import ASCENTS, PITCH_TIMES, ROCKET_REFERENCES, collocate, nine_pitch_angles, rocket_reference
-from envs import ROCKET, fly_rocket, rk4
+import envs
+from baselines import ASCENTS, STORED, nine_pitch_angles, rocket_reference
+from envs import ROCKET, ROCKETS, fly_rocket, rk4
 from envs import ascent as dynamics
 
 ROOT = Path(__file__).resolve().parents[1]
 KEYS = {"final_mass_kg", "final_time_s", "error_norm", "replay_error_norm", "solve_seconds", "status"}
-FREE = ("free", "free_table_isp", "drag_free")
+FREE = ("free", "free_table_isp", "drag_free", "TwoStageLEO-v0")
+LEO = ROCKETS["TwoStageLEO-v0"].rocket
+VEHICLES = {key: case.rocket for key, case in ASCENTS.items()} | {"TwoStageLEO-v0": LEO}  # by the solves' keys
+OPPONENTS = {"free": "nine_pitch_angles", "fixed_capped": "nine_pitch_angles_fixed"}
+OPPONENTS["TwoStageLEO-v0"] = "nine_pitch_angles_TwoStageLEO-v0"
 
 
 @pytest.fixture(scope="module")
@@ -37,11 +44,11 @@ def command(tmp_path_factory):
 def flights(command):
     """What the npz holds, flown by the environment without anything from baselines.py."""
     _, _, arrays = command
-    return {key: fly(arrays, key) for key in ASCENTS}
+    return {key: fly(arrays, key) for key in VEHICLES}
 
 
 def fly(arrays, key, env_id="RocketAscent-v0"):
-    rocket, u = ASCENTS[key].rocket, arrays[f"{key}_u"]
+    rocket, u = VEHICLES[key], arrays[f"{key}_u"]
     options = {"end_time": arrays[f"{key}_t"][-1], "rocket": rocket, "table_isp": key == "free_table_isp"}
     return fly_rocket(env_id, lambda obs, k: u[k : k + 1], **options)
 
@@ -89,7 +96,8 @@ def test_drag_costs_mass(command):
 
 def test_solving_twice_gives_the_same_bits(command):
     _, numbers, arrays = command
-    again, flight, _ = baselines.solve_ascent("free")
+    baselines.solve_ascent.cache_clear()
+    again, flight, _ = baselines.solve_ascent(ASCENTS["free"])
     assert {**again, "solve_seconds": 0} == {**numbers["free"], "solve_seconds": 0}
     np.testing.assert_array_equal(flight["u"], arrays["free_u"])
 
@@ -107,7 +115,7 @@ def test_optimum_for_the_orbit_reached():
 
 def test_every_solve_is_ready_to_fly(command, flights):
     _, numbers, arrays = command
-    assert set(arrays) == {f"{key}_{name}" for key in ASCENTS for name in "tu"}
+    assert set(arrays) == {f"{key}_{name}" for key in VEHICLES for name in "tu"}
     for key, flight in flights.items():
         assert set(numbers[key]) >= KEYS and numbers[key]["status"] == "Solve_Succeeded"
         # the fixed-time programs have the environment's own steps; the others are collocated, and held over its steps
@@ -162,21 +170,20 @@ def shipped(command, tmp_path, monkeypatch):
     return tmp_path
 
 
-def refuse(key):
-    raise AssertionError(f"{key} was solved anew")
+def refuse(case):
+    raise AssertionError(f"{case.key} was solved anew")
 
 
-@pytest.mark.parametrize("env_id", ROCKET_REFERENCES)
+@pytest.mark.parametrize("env_id", ROCKETS)
 def test_reference_is_the_solve(command, flights, shipped, monkeypatch, env_id):
     monkeypatch.setattr(baselines, "solve_ascent", refuse)
     _, numbers, _ = command
-    key, found = ROCKET_REFERENCES[env_id], rocket_reference(env_id)
+    key, found = STORED.get(env_id, env_id), rocket_reference(env_id)
     assert found["reference_mass_kg"] == numbers[key]["final_mass_kg"]
     assert found["reference_time_s"] == numbers[key]["final_time_s"]
     np.testing.assert_allclose(found["y"][:-1], flights[key]["y"][:-1], rtol=0, atol=1e-3)
     assert found["error_norm"] < 2e-5 and found["t"][-1] == pytest.approx(flights[key]["t"][-1], abs=1e-3)
-    opponent = {"free": "nine_pitch_angles", "fixed_capped": "nine_pitch_angles_fixed"}[key]
-    assert found["nine_pitch_error_norm"] == pytest.approx(numbers[opponent]["error_norm"], rel=1e-3)
+    assert found["nine_pitch_error_norm"] == pytest.approx(numbers[OPPONENTS[key]]["error_norm"], rel=1e-3)
     assert found["nine_pitch_error_norm"] < 1e-3
 
 
@@ -217,9 +224,9 @@ def test_reference_is_solved_anew_where_the_files_do_not_serve(command, flights,
     damage(shipped)
     before, solved = {path.name: path.read_bytes() for path in shipped.iterdir()}, []
 
-    def solve(key):
-        solved.append(key)
-        return command[1][key], flights[key], None
+    def solve(case):
+        solved.append(case.key)
+        return command[1][case.key], flights[case.key], None
 
     monkeypatch.setattr(baselines, "solve_ascent", solve)
     found = rocket_reference("RocketAscentCutoff-v0")
@@ -233,11 +240,12 @@ def test_results_hold_the_command_s_files(command):
     _, numbers, arrays = command
     kept = json.loads((baselines.RESULTS / "rocket_reference.json").read_text())
     assert kept.keys() == numbers.keys()
-    for key in ASCENTS:
+    for key in VEHICLES:
         assert kept[key]["final_mass_kg"] == pytest.approx(numbers[key]["final_mass_kg"], rel=1e-9)
     with np.load(baselines.RESULTS / "rocket_reference.npz") as file:
         assert set(file) == set(arrays)
-        np.testing.assert_allclose(file["free_t"], arrays["free_t"], rtol=0, atol=1e-5)
+        for key in FREE:
+            np.testing.assert_allclose(file[f"{key}_t"], arrays[f"{key}_t"], rtol=0, atol=1e-5)
 
 
 def test_reference_needs_no_casadi():
@@ -246,33 +254,129 @@ def test_reference_needs_no_casadi():
 
 
 def test_unknown_id_is_refused():
-    with pytest.raises(ValueError, match="'Rocket-v0'; it must be one of RocketAscentCutoff-v0, RocketAscent-v0"):
+    ids = "RocketAscent-v0, RocketAscentCutoff-v0, TwoStageLEO-v0"
+    with pytest.raises(ValueError, match=f"'Rocket-v0'; it must be one of {ids}$"):
         rocket_reference("Rocket-v0")
 
 
 # --- opponent, failures -----------------------------------------------------------------------------------------------
 
 
-def test_nine_angles_are_all_the_opponent_knows(flights):
-    flight = nine_pitch_angles("RocketAscentCutoff-v0", flights["free"])
-    assert len(PITCH_TIMES) + 5 == 9
-    assert 1e-5 < flight["error_norm"] < 5e-4 and flight["final_mass_kg"] == pytest.approx(7531, abs=3)
-    changed = {**flights["free"], "u": flights["free"]["u"].copy()}
-    changed["u"][[20, 60, 100, 180, 260, 330, 420]] = [1.0, 0.0, 0.0]  # between the nine times
-    assert nine_pitch_angles("RocketAscentCutoff-v0", changed)["error_norm"] == flight["error_norm"]
+@pytest.mark.parametrize(
+    "env_id, key, between, kg",
+    [
+        ("RocketAscentCutoff-v0", "free", [20, 60, 100, 180, 260, 330, 420], (7531, 3)),
+        ("TwoStageLEO-v0", "TwoStageLEO-v0", [7, 25, 70, 90, 120, 160, 210, 250], (25890, 15)),
+    ],
+)
+def test_nine_angles_are_all_the_opponent_knows(flights, env_id, key, between, kg):
+    """Of the second vehicle pitch and yaw: its optimum leaves the target's plane."""
+    flight = nine_pitch_angles(env_id, flights[key], VEHICLES[key])
+    assert 1e-5 < flight["error_norm"] < 5e-4 and flight["final_mass_kg"] == pytest.approx(kg[0], abs=kg[1])
+    changed = {**flights[key], "u": flights[key]["u"].copy()}
+    changed["u"][between] = changed["y"][between, :3] / envs.ROCKET.Re  # up, between the nine times
+    assert nine_pitch_angles(env_id, changed, VEHICLES[key])["error_norm"] == flight["error_norm"]
 
 
-def test_an_infeasible_ascent_is_an_error_of_one_line(monkeypatch):
-    monkeypatch.setitem(ASCENTS, "heavy", ASCENTS["free"]._replace(key="heavy", rocket=replace(ROCKET, payload=40e3)))
-    with pytest.raises(RuntimeError, match="^rocket ascent heavy: IPOPT stopped with [A-Za-z_]+$"):
-        collocate(ASCENTS["heavy"], 8)
+def test_yaw_is_flown_where_the_optimum_has_some(flights):
+    """The paper's optimum is in the plane, and so is its opponent; the second vehicle's leaves it by five degrees."""
+    out = {}
+    for key in ("free", "TwoStageLEO-v0"):
+        u = nine_pitch_angles("TwoStageLEO-v0", flights[key], VEHICLES[key])["u"]
+        out[key] = np.abs(u @ envs.target_axes(VEHICLES[key])[2]).max()
+    assert out["free"] < 1e-3 < 0.05 < out["TwoStageLEO-v0"] < 0.1
+
+
+def test_pitch_times_are_nine():
+    """The paper's four burns, then fewer: the longest gaps are halved; every staging of the rocket is among them."""
+    np.testing.assert_allclose(
+        baselines.pitch_times(ROCKET, 924.0), [0, 30, 75.2, 150.4, 261, 426.75, 592.5, 758.25, 924]
+    )
+    # 0, 30, 162, 258, 354, 450, 546 by the rule; then 30 to 162 and the first of the last burn's quarters are halved
+    np.testing.assert_allclose(baselines.pitch_times(LEO, 546.0), [0, 30, 96, 162, 210, 258, 354, 450, 546])
+    times = baselines.pitch_times(single_burn(), 300.0)
+    assert len(times) == 9 and (np.diff(times) > 0).all() and times[0] == 0 and times[-1] == 300
+    assert {30, 75, 150, 225} < set(times)
+
+
+@pytest.mark.parametrize(
+    "rocket, end", [(ROCKET, 900.0), (LEO, 521.7), (replace(ROCKET, end_time=850.0), 799.0), (single_burn(), 235.0)]
+)
+def test_guesses_end_within_the_last_burn_and_the_flight(rocket, end):
+    guesses = baselines.ascent_guesses(rocket)
+    assert guesses[0][0] == pytest.approx(end) and len(guesses) == 4
+    for final_time, tilt_time in guesses:
+        assert rocket.last_ignition < final_time < rocket.end_time and 0 < tilt_time < final_time
+    # a last burn that is short or begins late
+    burns = (*rocket.burns[:-1], replace(rocket.burns[-1], end=rocket.last_ignition + 20.0))
+    short = replace(rocket, burns=burns, end_time=burns[-1].end)
+    assert all(short.last_ignition < final_time < short.end_time for final_time, _ in baselines.ascent_guesses(short))
+
+
+def test_final_time_is_bounded_by_the_flights_end():
+    """Below the optimum's 924 s there is an optimum no more; above it the bound does not touch it."""
+    case = baselines.Ascent("short", replace(ROCKET, end_time=930.0))
+    assert baselines.collocation_mesh(case, 900.0, 80).final_time == (261.0, 930.0)
+    assert baselines.optimise_ascent(case)["final_time"] == pytest.approx(924.1392, abs=1e-3)
+
+
+def test_ceiling_is_the_missions():
+    """With fixed time the reference stays below it; with cut-off, and without a ceiling, there is no bound."""
+    fixed, cutoff = ROCKETS["RocketAscent-v0"], ROCKETS["RocketAscentCutoff-v0"]
+    assert baselines.mission_ascent("fixed_capped", fixed) == ASCENTS["fixed_capped"]
+    assert baselines.mission_ascent("free", cutoff) == ASCENTS["free"]
+    assert baselines.mission_ascent("fixed", replace(fixed, ceiling_km=None)) == ASCENTS["fixed"]
+    assert baselines.mission_ascent("lower", replace(fixed, ceiling_km=240.0)).ceiling == 240e3
+
+
+@pytest.mark.parametrize("ceiling_km", [None, 260.0])
+def test_another_ceiling_is_another_reference(monkeypatch, flights, ceiling_km):
+    """The paper's id with another ceiling, or none, does not find the stored optimum below 250 km."""
+    solved = []
+    numbers = {"final_mass_kg": 6644.0, "final_time_s": 961.0}
+    monkeypatch.setattr(
+        baselines, "solve_ascent", lambda case: solved.append(case) or (numbers, flights["fixed"], None)
+    )
+    monkeypatch.setitem(ROCKETS, "RocketAscent-v0", replace(ROCKETS["RocketAscent-v0"], ceiling_km=ceiling_km))
+    found = rocket_reference("RocketAscent-v0")
+    assert found["max_altitude_km"] > 250.1, "the flight without a ceiling"
+    assert [(case.ceiling, case.free) for case in solved] == [(np.inf if ceiling_km is None else 260e3, False)]
+
+
+def test_options_change_what_is_solved(monkeypatch, flights):
+    solved = []
+    numbers = {"final_mass_kg": 7000.0, "final_time_s": 924.0}
+    monkeypatch.setattr(baselines, "solve_ascent", lambda case: solved.append(case) or (numbers, flights["free"], None))
+    mine = replace(ROCKET, payload=4000.0)
+    rocket_reference("RocketAscentCutoff-v0", rocket=mine)
+    rocket_reference("RocketAscentCutoff-v0", table_isp=True)
+    rocket_reference("RocketAscentCutoff-v0", rocket=ROCKET, table_isp=False)
+    assert [case.rocket for case in solved] == [mine, replace(ROCKET, table_isp=True)]
+
+
+# --- failures ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "changes, names",
+    [({"payload": 45e3}, ["payload, 45000.0 kg"]), ({"raan": 244.5}, ["raan, 244.5 "])],
+)
+def test_an_infeasible_ascent_is_an_error_of_one_line(changes, names):
+    """It says what to look at; 334.5108 is -arcsin(tan 28.5 / tan 51.6) in degrees."""
+    case = baselines.Ascent("heavy", replace(LEO, **changes))
+    with pytest.raises(RuntimeError) as error:
+        baselines.optimise_ascent(case, 8)
+    message = str(error.value)
+    assert re.match("^rocket ascent heavy: IPOPT stopped with [A-Za-z_]+, from 4 guesses: ", message)
+    assert chr(10) not in message and all(name in message for name in [*names, "334.5108", "its i, 51.6"])
 
 
 def test_a_flight_that_misses_is_an_error(flights, monkeypatch):
     early = {"u": flights["fixed"]["u"], "final_time": 960.0}
     monkeypatch.setattr(baselines, "ascend", lambda case, mesh, guess: early)
+    baselines.solve_ascent.cache_clear()
     with pytest.raises(RuntimeError, match="rocket ascent fixed: flown by the environment it misses by 0.0"):
-        baselines.solve_ascent("fixed")
+        baselines.solve_ascent(ASCENTS["fixed"])
 
 
 def test_nothing_is_written_unless_asked(tmp_path, monkeypatch):

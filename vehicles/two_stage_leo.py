@@ -7,7 +7,7 @@ dry, 934 kN, 397 s, 348 s of specific impulse; 3.7 m across): an example, not a 
 
 import envs
 
-STAGE_1 = envs.Engine(total_mass=433e3, propellant=411e3, thrust=7.6e6, isp=305.0, burn_time=162.0)
+STAGE_1 = envs.Engine(total_mass=433e3, propellant=411e3, thrust=7.6e6, isp=306.0, burn_time=162.0)
 STAGE_2 = envs.Engine(total_mass=111.5e3, propellant=107.5e3, thrust=934e3, isp=348.0, burn_time=393.0)
 
 ROCKET = envs.Rocket(

@@ -1,0 +1,263 @@
+"""The rocket's five rewards, with both vehicles: step by step against the formulas' words in plain loops, by hand."""
+
+import math
+
+import numpy as np
+import pytest
+from rocket_oracle import (
+    CUTOFF,
+    FIXED,
+    LEO,
+    LEO_FIXED,
+    PARTS,
+    RE,
+    TWO_STAGE,
+    VEHICLES,
+    both,
+    energy,
+    fly,
+    make,
+    single,
+)
+
+from envs import (
+    PAPER_MISSION,
+    REFERENCE_PITCH,
+    ROCKETS,
+    Mission,
+    guidance_reward,
+    orbital_elements,
+    orbital_reward,
+    penalties,
+    precision_points,
+    terminal_error,
+    terminal_reward,
+    trajectory_reward,
+)
+
+
+def expected_parts(v, seen, u, final, mass_weight, trajectory_weight, guidance_weight, knots):
+    """The five parts (K, 5) of each step of a flight, from the formulas' words, by a plain loop."""
+    parts = np.zeros((len(u), 5))
+    for k in range(len(u)):
+        before, after, begin = seen[k], seen[k + 1], 2.0 * k
+        end = final["final_time_s"] if k == len(u) - 1 else begin + 2
+        altitude = np.linalg.norm(after[:3]) - RE
+        parts[k, 0] = 10 * (np.abs(v.goal_errors(before)).sum() - np.abs(v.goal_errors(after)).sum())
+        if begin < v.last_ignition:
+            parts[k, 1] = trajectory_weight * (energy(after) - energy(before)) / 1e6
+        if knots and begin <= v.guided_until:
+            pitch = math.radians(np.interp(begin, *knots))
+            up, along, _ = v.up_along_cross(before)
+            parts[k, 2] = -guidance_weight * (1 - u[k] @ (math.sin(pitch) * up + math.cos(pitch) * along))
+        parts[k, 3] -= 40 * (altitude < 0)
+        parts[k, 3] -= 0.024 * min(max((altitude - v.ceiling + 5e3) / 100e3, 0), 1)
+        if end > 300:
+            parts[k, 3] -= 0.024 * min(max((110e3 - altitude) / 30e3, 0), 1)
+        if k:
+            parts[k, 3] -= 0.001 * np.linalg.norm(u[k] - u[k - 1])
+        if begin >= v.last_ignition:
+            parts[k, 3] -= mass_weight * (before[6] - after[6]) / v.mass_unit
+        if altitude < 0:
+            parts[k, 3] -= mass_weight * min(after[6] - v.dry_mass, v.last_propellant) / v.mass_unit
+        if k == len(u) - 1:
+            parts[k, 4] = -2 * math.log(1 + np.linalg.norm(v.goal_errors(after)) / 0.005)
+    return parts
+
+
+LINEAR = ([0, 150.4], [90, 40])
+KNOTS = ([0, 10, 40, 75.2, 150.4], [90, 88, 72, 55, 35])
+KNOTS_OF_TWO_STAGES = ([0, 10.77127660, 43.08510638, 81, 162], [90, 88, 72, 55, 35])  # its 162 s for the paper's 150.4
+ALL_WEIGHTS = {"guidance": "knots", "mass_weight": 0.3, "trajectory_weight": 0.7, "guidance_weight": 0.2}
+
+
+@pytest.mark.parametrize(
+    "env_id, steering, weights, knots",
+    [
+        (CUTOFF, "ascent", ALL_WEIGHTS, KNOTS),
+        (FIXED, "ascent", {"guidance": "linear"}, LINEAR),
+        (FIXED, "over the top", ALL_WEIGHTS, KNOTS),
+        (FIXED, "over the top", {}, None),
+        (CUTOFF, "late dive", ALL_WEIGHTS, KNOTS),
+        (FIXED, "early crash", {}, None),
+        (LEO, "ascent", ALL_WEIGHTS, KNOTS_OF_TWO_STAGES),
+        (LEO_FIXED, "over the top", ALL_WEIGHTS, KNOTS_OF_TWO_STAGES),
+        (LEO, "late dive", ALL_WEIGHTS, KNOTS_OF_TWO_STAGES),
+        (LEO_FIXED, "early crash", {}, None),
+    ],
+)
+def test_rewards_follow_the_formulas(env_id, steering, weights, knots):
+    v = VEHICLES[env_id]
+    envs = make(env_id, action_frame="local")
+    defaults = {"mass_weight": 0.0, "trajectory_weight": 0.0, "guidance_weight": 0.1}
+    for name, value in defaults.items():
+        assert getattr(envs.unwrapped, name) == value
+    assert envs.unwrapped.guidance == "none"
+    for name, value in weights.items():
+        setattr(envs.unwrapped, name, value)
+    actions = []
+    steer = lambda obs, t: actions.append(v.steering[steering](obs, t)) or actions[-1]  # noqa: E731
+    seen, rewards, final = fly(envs, steer)
+    u = np.array([np.array(a) / np.linalg.norm(a) @ v.up_along_cross(s) for a, s in zip(actions, seen)])
+    numbers = {name: weights.get(name, value) for name, value in defaults.items()}
+    parts = expected_parts(v, seen, u, final, **numbers, knots=knots)
+    np.testing.assert_allclose(rewards, parts.sum(axis=1), rtol=1e-10, atol=1e-11)
+    got = [final[name] for name in PARTS]
+    np.testing.assert_allclose(got, parts.sum(axis=0), rtol=1e-10, atol=1e-10)
+    assert final["episodic_return"] == pytest.approx(rewards.sum(), abs=1e-10)
+    assert final["episodic_return"] == pytest.approx(sum(got), abs=1e-10)
+    first, last = (np.abs(v.goal_errors(seen[k])).sum() for k in (0, -1))
+    assert final["R_orbital"] == pytest.approx(10 * (first - last), abs=1e-10)
+    if knots is None:
+        assert final["R_guidance"] == final["R_trajectory"] == 0
+    else:
+        assert final["R_guidance"] < 0 and (parts[math.floor(v.guided_until / 2) + 1 :, 2] == 0).all()
+    assert final["crashed"] == (steering in ("late dive", "early crash"))
+    assert (parts[-1, 3] <= -40) == final["crashed"]
+    # what is reported besides
+    error = terminal_error(seen[-1], ROCKETS[v.cutoff].rocket)
+    np.testing.assert_allclose(final["error"], error, rtol=1e-12, atol=1e-15)
+    assert final["error_norm"] == pytest.approx(math.sqrt((error**2).sum()))
+    d = final["error_norm"]
+    assert final["points"] == pytest.approx(2000 * (d < 0.02) + 1600 * (math.exp(-d / 0.01) + math.exp(-d / 0.001)))
+    elements = orbital_elements(seen[-1])
+    np.testing.assert_allclose(
+        [final["a_km"], final["e"], *(final[f"{name}_deg"] for name in ("i", "raan", "argp"))],
+        [elements.a / 1e3, elements.e, *np.degrees([elements.i, elements.raan, elements.argp])],
+    )
+    heights = np.linalg.norm(seen[1:, :3], axis=1) - RE
+    assert final["max_altitude_km"] == pytest.approx(max(heights.max(), 0) / 1e3, abs=1e-9)
+
+
+@both
+@pytest.mark.parametrize("guidance", ["none", "linear", "knots"])
+def test_guidance_is_exactly_zero_after_its_time(v, guidance):
+    """Two flights, with and without: what they pay for each step is the same to the bit from then on."""
+    pay = []
+    for name in (guidance, "none"):
+        envs = make(v.fixed, action_frame="local")
+        envs.unwrapped.guidance, envs.unwrapped.end_time = name, 400.0
+        pay.append(fly(envs, lambda obs, t: v.programme(2 * t))[1])
+    different = np.flatnonzero(pay[0] != pay[1])
+    assert (v.grid[different] <= v.guided_until).all() and (len(different) > 70) == (guidance != "none")
+    assert set(REFERENCE_PITCH) == {"none", "linear", "knots"}
+
+
+def test_reward_functions_at_points_computed_by_hand():
+    assert orbital_reward(1.5, 1.2) == pytest.approx(3.0)
+    assert trajectory_reward(-60e6, -58e6, True, 0.5) == pytest.approx(1.0)
+    assert trajectory_reward(-60e6, -58e6, False, 0.5) == 0 and trajectory_reward(-60e6, -58e6, True, 0.0) == 0
+    frame, u = np.eye(3)[:, :, None], np.array([[0.6], [0.0], [0.8]])
+    for pitch, expected in ((90, -0.04), (0, -0.1), (30, -0.07), (np.nan, 0.0)):
+        got = guidance_reward(u, *frame[:2], np.radians([pitch]), 0.1)
+        assert got[0] == pytest.approx(expected, abs=1e-15)
+    hand = [  # altitude, time, turn, burnt, left, mass weight; value
+        ((200e3, 500, 0.0, 0.0, 9e3, 0.0), 0.0),
+        ((-1.0, 10, 0.0, 0.0, 9e3, 0.0), -40.0),
+        ((0.0, 10, 0.0, 0.0, 9e3, 1.0), 0.0),
+        ((245e3, 500, 0.0, 0.0, 9e3, 0.0), 0.0),
+        ((295e3, 100, 0.0, 0.0, 9e3, 0.0), -0.012),
+        ((400e3, 500, 0.0, 0.0, 9e3, 0.0), -0.024),
+        ((95e3, 500, 0.0, 0.0, 9e3, 0.0), -0.012),
+        ((95e3, 300, 0.0, 0.0, 9e3, 0.0), 0.0),
+        ((50e3, 302, 0.0, 0.0, 9e3, 0.0), -0.024),
+        ((-1.0, 500, 2.0, 50.0, 1e3, 0.4), -40 - 0.024 - 0.002 - 0.2 - 4),
+        ((200e3, 500, 0.5, 48.0, 1e3, 1.0), -0.0005 - 0.48),
+    ]
+    columns = [np.array(column) for column in zip(*(arguments for arguments, _ in hand))]
+    got = penalties(PAPER_MISSION, *columns)
+    np.testing.assert_allclose(got, [value for _, value in hand], rtol=0, atol=1e-15)
+    logs = [0, -2 * math.log(2), -2 * math.log(100)]
+    np.testing.assert_allclose(terminal_reward(np.array([0.0, 0.005, 0.495])), logs)
+    np.testing.assert_allclose(terminal_reward(np.array([0.0, 0.001, 0.099]), 0.001), logs)
+    got = precision_points(np.array([0.0, 0.01, 0.02, 1.0]))
+    expected = [5200, 2000 + 1600 * (math.exp(-1) + math.exp(-10)), 1600 * math.exp(-2), 0]
+    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-5)
+
+
+def test_penalties_are_the_missions_by_hand():
+    """No ceiling: no altitude is too high. A mass unit of its own, or 1.5 % of the dry mass; another floor, late."""
+    rows, mission = [(400e3, 500, 0, 0, 0, 1), (4e7, 500, 0, 36.0, 0, 1), (-1, 9, 0, 0, 72, 2)], ROCKETS[LEO]
+    args = [np.array(column) for column in zip(*rows)]
+    np.testing.assert_allclose(penalties(mission, *args), [0, -0.1, -40 - 2 * 72 / 360], rtol=0, atol=1e-15)
+    own = Mission(mission.rocket, ceiling_km=420.0, mass_unit=72.0, floor_km=80.0, late=100.0)
+    np.testing.assert_allclose(penalties(own, *args), [0, -0.024 - 0.5, -40 - 2], rtol=0, atol=1e-15)
+    height, time = np.array([465e3, 415e3, 65e3, 65e3, 85e3]), np.array([99.0, 99.0, 99.0, 101.0, 101.0])
+    got = penalties(own, height, time, 0.0, 0.0, 0.0, 0.0)
+    np.testing.assert_allclose(got, [-0.012, 0, 0, -0.012, 0], rtol=0, atol=1e-15)
+
+
+@both
+def test_weights_of_the_single_environment(v):
+    returns = {}
+    changes = {"mass_weight": 2.0, "trajectory_weight": 0.5, "guidance": "knots", "guidance_weight": 5.0}
+    for name, value in changes.items():
+        env = single(v.fixed, action_frame="local")
+        if name == "guidance_weight":
+            env.unwrapped.guidance = "knots"
+        setattr(env.unwrapped, name, value)
+        assert getattr(env.unwrapped, name) == value
+        env.unwrapped.end_time = 400.0
+        env.reset()
+        steps = [env.step(v.programme(2 * t)) for t in range(200)]
+        returns[name] = steps[-1][4]
+        assert steps[-1][4]["episodic_return"] == pytest.approx(sum(step[1] for step in steps), abs=1e-10)
+    envs = make(v.fixed, action_frame="local")
+    envs.unwrapped.end_time = 400.0
+    plain = fly(envs, lambda obs, t: v.programme(2 * t))[2]
+    burnt = v.last_flow * (400 - (162 if v is TWO_STAGE else 262))  # by steps that begin in the last phase
+    assert returns["mass_weight"]["R_penalties"] - plain["R_penalties"] == pytest.approx(
+        -2 * burnt / v.mass_unit, abs=1e-9
+    )
+    assert returns["trajectory_weight"]["R_trajectory"] > 1
+    assert returns["guidance_weight"]["R_guidance"] == pytest.approx(50 * returns["guidance"]["R_guidance"])
+    for changed, final in returns.items():
+        for part in PARTS:
+            affected = {"mass_weight": "R_penalties", "trajectory_weight": "R_trajectory"}.get(changed, "R_guidance")
+            assert (final[part] == plain[part]) == (part != affected), (changed, part)
+
+
+@pytest.mark.parametrize("env_id, steering", [(FIXED, "early crash"), (CUTOFF, "ascent"), (LEO, "ascent")])
+def test_terminal_scale_changes_only_the_last_reward(env_id, steering):
+    v = VEHICLES[env_id]
+    pay, finals = [], []
+    for scale in (0.005, 0.0005, 0.02):
+        envs = make(env_id, action_frame="local")
+        assert envs.unwrapped.terminal_scale == 0.005
+        envs.unwrapped.terminal_scale = scale
+        _, rewards, final = fly(envs, v.steering[steering])
+        pay.append(rewards)
+        finals.append(final)
+    d = finals[0]["error_norm"]
+    assert finals[0]["R_terminal"] == pytest.approx(-2 * math.log(1 + d / 0.005))
+    for rewards, final, scale in zip(pay, finals, (0.005, 0.0005, 0.02)):
+        np.testing.assert_array_equal(rewards[:-1], pay[0][:-1])
+        paid = rewards[-1] - pay[0][-1]
+        assert paid == pytest.approx(2 * math.log(1 + d / 0.005) - 2 * math.log(1 + d / scale), abs=1e-10)
+        for key, value in final.items():
+            np.testing.assert_array_equal(value, finals[0][key])
+
+
+@both
+def test_terminal_scale_in_a_batch_that_ends_at_different_times(v):
+    """Each environment is paid at its own end, by the scale that is set then."""
+    envs, plain = make(v.fixed, 2), make(v.fixed, 2)
+    envs.unwrapped.terminal_scale = 0.05
+    envs.reset(), plain.reset()
+    outward = plain.unwrapped.rocket.x0[:3]
+    differ, ended = [], []
+    for t in range(v.steps):
+        action = np.array([outward, -outward if t < 30 else outward])  # the second falls back and crashes
+        differ.append(envs.step(action)[1] - plain.step(action)[1])
+        ended.append(plain.unwrapped.t == 0)
+    np.testing.assert_array_equal(np.array(differ) > 0, ended)
+    assert ended[-1][0] and sum(row[0] for row in ended) == 1 and sum(row[1] for row in ended) >= 1
+
+
+@pytest.mark.parametrize("maker", [make, single])
+@pytest.mark.parametrize("scale", [0.0, -0.005, math.nan, math.inf])
+def test_bad_terminal_scales_are_refused(maker, scale):
+    env = maker(FIXED)
+    env.unwrapped.terminal_scale = scale
+    with pytest.raises(ValueError, match=f"terminal_scale is {scale}; it must be positive and finite"):
+        env.reset()

@@ -1,0 +1,400 @@
+"""Rockets of your own: what cannot fly is refused in one line; what can goes through registration, environment,
+reference, evaluation, table and figures, whatever its number of burns, its site and its target."""
+
+import math
+import shutil
+import subprocess
+import sys
+import warnings
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import spiceypy
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from rocket_oracle import CUTOFF, FIXED, LEO, MU, RE, single_burn
+
+import baselines
+import envs
+import evaluate
+import figures
+from envs import BOOSTER, ROCKET, ROCKETS, BadInput, Burn, Engine, Rocket, register_rocket
+
+ROOT = Path(__file__).resolve().parents[1]
+TWO = ROCKETS[LEO].rocket
+FIRST, SECOND = (burn.engines[0][1] for burn in TWO.burns)
+
+
+@contextmanager
+def restored():
+    """What is registered within is gone after it, and what it replaced is back."""
+    missions, specs = dict(ROCKETS), dict(gym.registry)
+    try:
+        yield
+    finally:
+        for registry, before in ((ROCKETS, missions), (gym.registry, specs)):
+            registry.clear()
+            registry.update(before)
+        evaluate.optimum.cache_clear()
+
+
+@pytest.fixture(autouse=True)
+def own_registry():
+    with restored():
+        yield
+
+
+# --- refusals ---------------------------------------------------------------------------------------------------------
+
+
+def two_stages(first=FIRST, second=SECOND, number=1, dropped=1, end=162.0, last=555.0, **changes):
+    burns = (Burn(end, ((number, first),), ((dropped, first),) if dropped else ()), Burn(last, ((1, second),)))
+    return replace(TWO, burns=burns, **changes)
+
+
+REFUSED = {
+    "end_time is 556": lambda: replace(TWO, end_time=556.0),
+    "end_time is 0": lambda: replace(TWO, end_time=0.0),
+    "propellant of burns[0].engines, 411000.0 kg each, is 411000 kg in all": lambda: two_stages(end=163.0, last=556.0),
+    "propellant of burns[1].engines": lambda: two_stages(last=556.0),
+    "propellant of burns[0].engines": lambda: two_stages(replace(FIRST, isp=305.0), table_isp=True),
+    "number of an engine in burns[0].engines is 1; it must be positive and at most 0": lambda: two_stages(dropped=0),
+    "number of an engine in burns[0].engines is 7; it must be positive and at most 6": lambda: replace(
+        ROCKET, burns=(Burn(75.2, ((7, BOOSTER),), ((6, BOOSTER),)), *ROCKET.burns[2:])
+    ),
+    "number of an engine in burns[0].engines is -1": lambda: two_stages(number=-1),
+    "thrust of burns[0] is 5.5e+06 N; it must be above the weight at lift-off": lambda: two_stages(
+        replace(FIRST, thrust=5.5e6)
+    ),
+    "burns[1].end is 100.0": lambda: replace(TWO, burns=(TWO.burns[0], Burn(100.0, ((1, SECOND),)))),
+    "burns[1].end is nan": lambda: replace(TWO, burns=(TWO.burns[0], Burn(math.nan, ((1, SECOND),)))),
+    "burns[0].end is -1": lambda: replace(TWO, burns=(replace(TWO.burns[0], end=-1.0), TWO.burns[1])),
+    "burns[1].engines is ()": lambda: replace(TWO, burns=(TWO.burns[0], Burn(555.0, ()))),
+    "burns is ()": lambda: replace(TWO, burns=()),
+    "burns is [Burn": lambda: replace(TWO, burns=list(TWO.burns)),
+    "payload is nan": lambda: replace(TWO, payload=math.nan),
+    "payload is -1": lambda: replace(TWO, payload=-1.0),
+    "payload is heavy": lambda: replace(TWO, payload="heavy"),
+    "a is inf": lambda: replace(TWO, a=math.inf),
+    "a is -7": lambda: replace(TWO, a=-7e6),
+    "e is 1.0": lambda: replace(TWO, e=1.0),
+    "e is -0.1": lambda: replace(TWO, e=-0.1),
+    "i is 181": lambda: replace(TWO, i=181.0),
+    "raan is nan": lambda: replace(TWO, raan=math.nan),
+    "latitude is 90": lambda: replace(TWO, latitude=90.0),
+    "dt is 0": lambda: replace(TWO, dt=0.0),
+    "S is -1": lambda: replace(TWO, S=-1.0),
+    "engine's thrust is nan": lambda: replace(FIRST, thrust=math.nan),
+    "engine's thrust is -1": lambda: replace(FIRST, thrust=-1.0),
+    "engine's isp is 0": lambda: replace(FIRST, isp=0.0),
+    "engine's burn_time is 0": lambda: replace(FIRST, burn_time=0.0),
+    "engine's total_mass is 0": lambda: replace(FIRST, total_mass=0.0),
+    "engine's propellant is 434000": lambda: replace(FIRST, propellant=434e3),
+    "engine's propellant is 0.0; it must be positive where it has thrust": lambda: replace(FIRST, propellant=0.0),
+}
+
+
+@pytest.mark.parametrize("message", REFUSED)
+def test_what_cannot_fly_is_refused_in_one_line(message):
+    with warnings.catch_warnings(), pytest.raises(BadInput) as error:
+        warnings.simplefilter("error")
+        REFUSED[message]()
+    assert message in str(error.value) and "\n" not in str(error.value) and "; it must" in str(error.value)
+
+
+def test_what_is_refused_can_fly_a_little_beside_it():
+    """The same changes on the other side of their bounds."""
+    weight = TWO.x0[6] * MU / RE**2
+    two_stages(replace(FIRST, thrust=1.001 * weight))
+    two_stages(last=554.0, end_time=554.0)
+    two_stages(table_isp=True)
+    replace(TWO, i=180.0 - 51.6, e=0.99, latitude=-51.0, payload=0.0, end_time=1.0)
+
+
+def test_plane_below_the_launch_latitude_is_a_warning():
+    for i, warned in ((28.4, True), (28.5, False), (151.5, False), (151.6, True), (0.0, True)):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            replace(TWO, i=i)
+        assert len(caught) == warned
+        assert all(f"i is {i} degrees, below the launch latitude 28.5" in str(w.message) for w in caught)
+
+
+# --- registration -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("env_id", ["DoubleIntegrator-v0", "CartPole-v1", "a/b", "", "my rocket", "DoubleIntegrator"])
+def test_foreign_ids_are_refused(env_id):
+    missions, specs = dict(ROCKETS), dict(gym.registry)
+    with pytest.raises(BadInput, match=f"^env_id is {env_id!r}; it must be a new id such as MyRocket-v0"):
+        register_rocket(env_id, TWO)
+    assert missions == ROCKETS and specs == gym.registry
+
+
+def test_registering_again_replaces(monkeypatch):
+    """Environment, reference and evaluation are the new rocket's; no line is printed about it."""
+    solved = []
+    monkeypatch.setattr(baselines, "solve_ascent", lambda case: solved.append(case.rocket) or 1 / 0)
+    lighter = replace(TWO, payload=19e3)
+    for rocket in (TWO, lighter):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            register_rocket("Again-v0", rocket, cutoff=True, late=200.0)
+        assert gym.make_vec("Again-v0", num_envs=2).unwrapped.rocket == rocket
+        assert gym.make("Again-v0").unwrapped.batch.mission.late == 200.0
+        with pytest.raises(ZeroDivisionError):
+            evaluate.evaluate("Again-v0", lambda obs, t: np.ones((1, 3)), 0, 1)
+    assert solved == [TWO, lighter]
+    register_rocket(LEO, lighter, cutoff=True)  # whose old reference is stored
+    with pytest.raises(ZeroDivisionError):
+        baselines.rocket_reference(LEO)
+
+
+def test_evaluation_does_not_keep_the_optimum_of_a_replaced_rocket(monkeypatch):
+    flight = envs.fly_rocket(LEO, lambda obs, t: np.ones((1, 3)), end_time=10.0)
+    numbers = {"reference_time_s": 1.0, "nine_pitch_error_norm": 1.0}
+
+    def reference(env_id, **options):
+        return flight | numbers | {"reference_mass_kg": ROCKETS[env_id].rocket.payload}
+
+    monkeypatch.setattr(baselines, "rocket_reference", reference)
+    for payload in (20e3, 19e3):
+        register_rocket("Again-v0", replace(TWO, payload=payload))
+        metrics, _ = evaluate.evaluate("Again-v0", lambda obs, t: np.array([[-1.0, 0, 0]]), 0, 1)
+        assert metrics["reference_mass_kg"] == payload
+
+
+def test_a_bad_file_of_vehicles_is_left_out_with_a_line(tmp_path):
+    for name in ("envs.py", "rocket.py"):
+        shutil.copy(ROOT / name, tmp_path)
+    (tmp_path / "vehicles").mkdir()
+    good = (ROOT / "vehicles" / "two_stage_leo.py").read_text()
+    (tmp_path / "vehicles" / "a_bad_one.py").write_text(good.replace("payload=20e3", "payload=-20e3"))
+    (tmp_path / "vehicles" / "b_foreign.py").write_text(good.replace("TwoStageLEO-v0", "VanDerPol-v0"))
+    (tmp_path / "vehicles" / "z_good.py").write_text(good)
+    code = "import envs, gymnasium; print(*envs.ROCKETS); print(gymnasium.make('TwoStageLEO-v0').reset()[0][6])"
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert done.stdout.split() == [FIXED, CUTOFF, LEO, "564500.0"]
+    first, second = done.stderr.splitlines()
+    assert first == "vehicles/a_bad_one.py is left out: a rocket's payload is -20000.0; it must not be negative"
+    assert second.startswith("vehicles/b_foreign.py is left out: env_id is 'VanDerPol-v0'")
+
+
+# --- one burn, three burns, another site and target -------------------------------------------------------------------
+
+
+def test_one_burn():
+    """No staging, no phase but the last: features of the clock, prices and arcs without a division by zero."""
+    register_rocket("Single-v0", single_burn(), cutoff=True)
+    env = gym.make_vec("Single-v0", num_envs=1, action_frame="local")
+    env.unwrapped.mass_weight, env.unwrapped.trajectory_weight, env.unwrapped.guidance = 1.0, 1.0, "linear"
+    with np.errstate(all="raise", under="ignore"):
+        obs, _ = env.reset()
+        assert obs[0, 6] == 40000 and obs[0, 7:].tolist() == [1.0, 0.0]
+        obs, reward, *_ = env.step(np.array([[1.0, 0.0, 0.0]]))
+        assert obs[0, 7:].tolist() == [1 - 2 / 250, 0.0]
+        flight = envs.fly_rocket("Single-v0", lambda obs, t: np.array([[1.0, 0.1, 0.0]]), action_frame="local")
+    assert flight["R_trajectory"] == 0, "every burn is the last"
+    burnt, dry = 2 * 36500 / 250, 3500.0
+    energy = env.unwrapped._parts[3, 0]
+    assert energy == pytest.approx(-burnt / (0.015 * dry))
+    assert flight["final_mass_kg"] == pytest.approx(3500 if flight["final_time_s"] == 250 else flight["final_mass_kg"])
+
+
+def three_burns(**changes):
+    """Two boosters, a core, a short last stage, from 5.2 degrees to a retrograde ellipse; with a ceiling."""
+    booster = Engine(total_mass=40e3, propellant=36e3, thrust=1.2e6, isp=280.0, burn_time=80.0)
+    core = Engine(total_mass=110e3, propellant=100e3, thrust=1.3e6, isp=330.0, burn_time=240.0)
+    last = Engine(total_mass=17e3, propellant=15e3, thrust=200e3, isp=450.0, burn_time=330.0)
+    burns = (
+        Burn(80.0, ((2, booster), (1, core)), ((2, booster),)),
+        Burn(240.0, ((1, core),), ((1, core),)),
+        Burn(570.0, ((1, last),)),
+    )
+    options = {"payload": 3e3, "S": 9.0, "latitude": 5.2, "end_time": 570.0, "a": 6.9e6, "e": 0.03, "i": 98.0}
+    return Rocket(**{"burns": burns, "raan": envs.launch_raan(5.2, 98.0), "argp": 20.0} | options | changes)
+
+
+@pytest.fixture(scope="module")
+def solved():
+    """The optima of two rockets, flown and evaluated: id -> (metrics, arrays, mission)."""
+    found = {}
+    with restored():
+        for env_id, rocket in {"Single-v0": single_burn(), "ThreeBurns-v0": three_burns()}.items():
+            mission = envs.Mission(rocket, cutoff=True, ceiling_km=400.0 if env_id == "ThreeBurns-v0" else None)
+            register_rocket(env_id, rocket, mission.cutoff, mission.ceiling_km)
+            reference = baselines.rocket_reference(env_id)
+            u = reference["u"]
+            metrics, arrays = evaluate.evaluate(env_id, lambda obs, t, u=u: u[t : t + 1], 0, 1, reference)
+            found[env_id] = metrics, arrays, mission
+    return found
+
+
+OWN = ["Single-v0", "ThreeBurns-v0"]
+
+
+@pytest.mark.parametrize("env_id", OWN)
+def test_a_rocket_of_your_own_from_reference_to_figures(solved, env_id, tmp_path):
+    metrics, arrays, mission = solved[env_id]
+    rocket = mission.rocket
+    register_rocket(env_id, rocket, mission.cutoff, mission.ceiling_km)
+    assert metrics["success"] and metrics["error_norm"] < 1e-3 and not metrics["crashed"]
+    assert metrics["mass_ratio"] == pytest.approx(1, abs=2e-3) and metrics["nine_pitch_error_norm"] < 0.05
+    # the last state's elements by CSPICE, beside the target's numbers
+    rp, e, i, raan, argp, *_ = spiceypy.oscelt(arrays["y"][-1, :6], 0.0, MU)
+    assert rp / (1 - e) == pytest.approx(rocket.a, rel=1e-4) and e == pytest.approx(rocket.e, abs=1e-3)
+    assert math.degrees(i) == pytest.approx(rocket.i, abs=0.05) == metrics["i_deg"]
+    assert (math.degrees(raan) - rocket.raan + 180) % 360 - 180 == pytest.approx(0, abs=0.05)
+    assert ("argp_error_deg" in metrics) == (rocket.e > 0)
+    if rocket.e:
+        assert metrics["argp_error_deg"] == pytest.approx(math.degrees(argp) - 20, abs=1e-6)
+    table = evaluate.table(metrics)
+    (row,) = (line for line in table.splitlines() if "argument of perigee" in line)
+    assert (row.split()[-4:] == ["-"] * 4) == (rocket.e == 0) and table.startswith(env_id)
+    paths = figures.draw(tmp_path, arrays, metrics)
+    assert [path.name for path in paths] == ["trajectory.png", "orbit.png"] and all(path.exists() for path in paths)
+
+
+@pytest.mark.parametrize("env_id", OWN)
+def test_figures_of_a_rocket_of_your_own(solved, env_id):
+    """Labels inside their panel, the whole target orbit, the launch site in its plane, a ceiling where there is one."""
+    metrics, arrays, mission = solved[env_id]
+    rocket = mission.rocket
+    register_rocket(env_id, rocket, mission.cutoff, mission.ceiling_km)
+    figure = figures.draw_ascent(arrays, metrics)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    panel = next(ax for ax in figure.axes if "mass" in ax.get_ylabel())
+    assert len(panel.texts) == len(rocket.burns) - 1
+    for text in panel.texts:
+        inner, outer = text.get_window_extent(canvas.get_renderer()), panel.get_window_extent()
+        assert outer.x0 <= inner.x0 and inner.x1 <= outer.x1 and outer.y0 <= inner.y0 and inner.y1 <= outer.y1
+    altitude = next(ax for ax in figure.axes if "altitude" in ax.get_ylabel())
+    level = [line.get_ydata()[0] for line in altitude.lines if line.get_color() == "tab:green"]
+    assert level == ([400.0] if env_id == "ThreeBurns-v0" else [])
+    plane, _, ground = figures.draw_orbit(arrays, metrics).axes
+    target = next(line.get_xydata() for line in plane.lines if line.get_label() == "target orbit")
+    lows, highs = np.array([plane.get_xlim(), plane.get_ylim()]).T
+    assert (lows < target.min(axis=0)).all() and (highs > target.max(axis=0)).all()
+    site = next(line.get_xydata() for line in ground.lines if line.get_label() == "target plane at launch")
+    assert np.hypot(*(site - [0, rocket.latitude]).T).min() < 0.5
+
+
+def stub(env_id, rocket):
+    """Metrics and arrays of a flight of a rocket registered here, as its own reference."""
+    register_rocket(env_id, rocket)
+    flight = envs.fly_rocket(env_id, lambda obs, t: np.array([[1.0, 0.2, 0.0]]), action_frame="local")
+    reference = flight | {"reference_mass_kg": 1.0, "reference_time_s": 1.0, "nine_pitch_error_norm": 1.0}
+    metrics = {"env_id": env_id} | evaluate.rocket_metrics(flight, reference, ROCKETS[env_id])
+    return metrics, {f"{key}{side}": flight[key] for key in "tuy" for side in ("", "_reference")}
+
+
+def test_late_staging_labels_stay_inside():
+    """A last stage of 20 s: its label stands to the left of the line."""
+    last = replace(SECOND, burn_time=20.0, propellant=5e3)
+    rocket = replace(TWO, burns=(TWO.burns[0], Burn(182.0, ((1, last),))), end_time=182.0)
+    metrics, arrays = stub("Late-v0", rocket)
+    figure = figures.draw_ascent(arrays, metrics)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    panel = next(ax for ax in figure.axes if "mass" in ax.get_ylabel())
+    (text,) = panel.texts
+    inner, outer = text.get_window_extent(canvas.get_renderer()), panel.get_window_extent()
+    assert outer.x0 <= inner.x0 and inner.x1 <= outer.x1 and "162 s: 22.00 t dropped" in text.get_text()
+
+
+@pytest.mark.parametrize("a, e", [(4.2e7, 0.0), (3e7, 0.5), (6.6e6, 0.0)])
+def test_orbit_figure_holds_the_whole_target_orbit(a, e):
+    """Also where its perigee is far above the Earth."""
+    metrics, arrays = stub("High-v0", replace(TWO, a=a, e=e))
+    plane = figures.draw_orbit(arrays, metrics).axes[0]
+    (west, east), (south, north) = plane.get_xlim(), plane.get_ylim()
+    b = a * math.sqrt(1 - e * e) / 1e6
+    assert west < -a * (1 + e) / 1e6 and east > a * (1 - e) / 1e6 and south < -b and north > b
+    assert west < -RE / 1e6 and east > RE / 1e6
+
+
+# --- evaluation against the rocket that flies -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("option", [{"rocket": replace(ROCKET, a=2e7, i=30.0, argp=120.0)}, {"table_isp": True}])
+def test_evaluation_is_against_the_rocket_that_flies(monkeypatch, option):
+    """Target, errors, table and the optimum asked for are the changed rocket's, not those of the id."""
+    flown = option.get("rocket", replace(ROCKET, table_isp=True))
+    solved = []
+
+    def solve(case):
+        solved.append(case.rocket)
+        flight = envs.fly_rocket(CUTOFF, lambda obs, t: np.array([[1.0, 0.1, 0.0]]), end_time=100.0, rocket=flown)
+        return {"final_mass_kg": 4321.0, "final_time_s": 100.0}, flight, None
+
+    monkeypatch.setattr(baselines, "solve_ascent", solve)
+    policy = lambda obs, t: np.array([[1.0, 0.3, 0.0]])  # noqa: E731
+    metrics, arrays = evaluate.evaluate(CUTOFF, policy, 0, 1, action_frame="local", **option)
+    assert solved == [flown] and metrics["reference_mass_kg"] == 4321.0
+    assert metrics["a_error_km"] == pytest.approx(metrics["a_km"] - flown.a / 1e3)
+    assert metrics["i_error_deg"] == pytest.approx(metrics["i_deg"] - flown.i)
+    s = arrays["y"][-1]
+    h, h_target = np.cross(s[:3], s[3:6]), envs.target_orbit(flown.target)[0]
+    e = np.cross(s[3:6], h) / MU - s[:3] / np.linalg.norm(s[:3])
+    error = [*(h - h_target) / np.linalg.norm(h_target), *(e - envs.target_orbit(flown.target)[1])]
+    assert metrics["error_norm"] == pytest.approx(np.linalg.norm(error))
+    table = evaluate.table(metrics, envs.flown_mission(ROCKETS[CUTOFF], **option))
+    (row,) = (line for line in table.splitlines() if "semi-major" in line)
+    assert float(row.split()[4]) == pytest.approx(flown.a / 1e3)
+
+
+@pytest.mark.parametrize("i, sense", [(0.0, 1), (180.0, -1)])
+@pytest.mark.parametrize("e", [0.0, 0.1])
+def test_equatorial_targets_are_measured_from_the_x_axis(i, sense, e):
+    """By CSPICE's state on an orbit whose perigee is 30 degrees from the x axis in the direction of flight, 50 of the
+    target's: neither node nor, on a circle, perigee have an error; what the elements mean is one number."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        rocket = replace(ROCKET, a=7e6, e=e, i=i, raan=sense * 20.0, argp=30.0)
+    mission = envs.Mission(rocket, cutoff=True)
+    conic = [7e6 * (1 - 0.1), 0.1, math.radians(i), 0.0, math.radians(30), 1.0, 0, MU]
+    state = np.append(spiceypy.conics(conic, 0), 5e3)
+    elements = envs.orbital_elements(state)
+    error = envs.terminal_error(state, rocket)
+    flight = {"error_norm": np.linalg.norm(error), "a_km": elements.a / 1e3, "e": elements.e}
+    flight |= {f"{name}_deg": math.degrees(getattr(elements, name)) for name in ("i", "raan", "argp")}
+    flight |= {"final_mass_kg": 5e3, "final_time_s": 1.0, "max_altitude_km": 1.0, "episodic_return": 0.0, "points": 0.0}
+    flight |= dict.fromkeys(envs.RocketVectorEnv.PARTS, 0.0) | {"crashed": False, "y": state[None], "t": np.ones(1)}
+    reference = flight | {"reference_mass_kg": 1.0, "reference_time_s": 1.0, "nine_pitch_error_norm": 1.0}
+    metrics = {"env_id": LEO, "eval_seed": 0} | evaluate.rocket_metrics(flight, reference, mission)
+    assert "raan_error_deg" not in metrics and ("argp_error_deg" in metrics) == (e > 0)
+    assert metrics["i_error_deg"] == pytest.approx(0, abs=1e-9) and metrics["a_error_km"] == pytest.approx(0, abs=1e-6)
+    assert metrics["argp_deg"] == pytest.approx(30)
+    table = evaluate.table(metrics, mission)
+    (row,) = (line for line in table.splitlines() if "perigee from the x axis" in line)
+    if e:
+        assert metrics["argp_error_deg"] == pytest.approx(30 - 50)
+        assert metrics["error_norm"] == pytest.approx(2 * 0.1 * math.sin(math.radians(10)), rel=1e-6)
+    else:
+        assert row.split()[-4:] == ["-"] * 4
+    (row,) = (line for line in table.splitlines() if "ascending" in line or "of the node" in line)
+    assert row.split()[-4:] == ["-"] * 4
+
+
+def test_mass_for_an_equatorial_orbit_reached_is_of_its_perigee(monkeypatch):
+    """The metric counts from the x axis; what is solved gets the element, from the node."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for i, sense in ((0.0, 1), (180.0, -1)):
+            register_rocket("Equatorial-v0", replace(ROCKET, i=i), cutoff=True)
+            asked = []
+            monkeypatch.setattr(baselines, "reached_optimum", lambda flight, rocket, a=asked: a.append(flight) or 1 / 0)
+            metrics = {"env_id": "Equatorial-v0", "success": True, "raan_deg": 300.0}
+            metrics["argp_deg"] = (100.0 + sense * 300.0) % 360
+            with pytest.raises(ZeroDivisionError):
+                evaluate.mass_reached(metrics)
+            assert asked[0]["argp_deg"] == pytest.approx(100.0) and asked[0]["raan_deg"] == 300.0
+
+
+def test_the_tests_leave_nothing_registered():
+    assert list(ROCKETS) == [FIXED, CUTOFF, LEO]
+    assert not {"Single-v0", "ThreeBurns-v0", "Again-v0"} & gym.registry.keys()
