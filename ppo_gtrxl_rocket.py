@@ -67,9 +67,9 @@ class Args:
     memory_noise: float = 0.1  # spread of the memory before an episode's start (Algorithm 1, line 5; the value is ours)
 
     # PPO (README has Table 1's beside ours)
-    total_updates: int = 600  # number of updates
+    total_updates: int = 500  # number of updates
     num_envs: int = 32  # parallel environments, one episode each per update
-    learning_rate: float = 2e-3  # learning rate of the first update; with --lr-schedule std where the deviation is 1
+    learning_rate: float = 3e-3  # learning rate of the first update; with --lr-schedule std where the deviation is 1
     learning_rate_final: float = 1e-5  # learning rate of the last update (linear in between; unused with std)
     gamma: float = 1.0  # the discount factor gamma
     gae_lambda: float = 0.985  # the lambda for the general advantage estimation
@@ -84,8 +84,8 @@ class Args:
     max_grad_norm: float = 0.5  # the maximum norm for the gradient clipping
     target_kl: float | None = 0.02  # the KL divergence from which an update takes no further step (none: no limit)
     lr_schedule: str = "std"  # linear, or std: --learning-rate times the policy's standard deviation
-    noise: str = "gated"  # who sets the log-std: learned, schedule (linear), gated (linear, waits for the episodes)
-    log_std: float = -1.9  # initial log of the policy's standard deviation, in the action's unit, -8 to 0.5
+    noise: str = "schedule"  # who sets the log-std: learned, schedule (linear), gated (linear, waits for the episodes)
+    log_std: float = -1.4  # initial log of the policy's standard deviation, in the action's unit, -8 to 0.5
     log_std_final: float = -6.2  # log-std of the last update, where it is not learned to the end
     flights_per_start: int = 32  # flights of each start, compared with one another (1: the paper)
     refine_from: float | None = None  # part of the updates after which the refinement begins (none: never)
