@@ -113,7 +113,7 @@ def set_curriculum(envs, args, progress, refines, std):
 
     Many starts at first, in the refinement each one several times. The waypoints' radius is --radius-curriculum times
     the true one at first and shrinks geometrically to it until the refinement, or 60 % of the updates. Refined flights
-    aim at a circle a tenth smaller, because the optimum lies on its edge.
+    aim at a circle a tenth smaller, because the optimum lies on its edge and the circle, 0.02, is small.
     """
     envs.flights_per_start = args.flights_per_start if refines else 1
     shrinks_until = 0.6 if args.refine_from is None else args.refine_from
