@@ -610,7 +610,7 @@ class RocketVectorEnv(BatchedEnv):
             ends, flow, dropped = (getattr(self.vehicles, name)[:-1, 0] for name in ("end", "flow", "dropped"))
             burnt = flow[:-1] * np.diff(ends[:-1], prepend=0.0)
             self._seen_mass = self.vehicles.mass[0] - np.append(0.0, np.cumsum(burnt + dropped[:-1]))
-            self._seen_flow = flow
+            self._seen_flow = flow.copy()  # drawn flows will be written where it lies
 
     def _spaces(self):
         """The spaces of one environment."""
