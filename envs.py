@@ -32,7 +32,10 @@ from gymnasium.vector.utils import batch_space
 
 from rocket import (  # noqa: F401 - every name of rocket.py is also one of envs.py
     BOOSTER,
+    DISPERSION,
+    DRAW,
     G0,
+    LARGEST_DISPERSION,
     PAPER_MISSION,
     REFERENCE_PITCH,
     ROCKET,
@@ -42,20 +45,28 @@ from rocket import (  # noqa: F401 - every name of rocket.py is also one of envs
     TERMINAL_SCALE,
     BadInput,
     Burn,
+    Dispersion,
     Engine,
     Mission,
     OrbitalElements,
     Rocket,
+    Vehicles,
     ascent,
     delta_v,
+    draw_bounds,
+    draw_names,
+    draw_vehicles,
     guidance_reward,
+    largest_draw,
     launch_raan,
     local_frame,
+    nominal_vehicles,
     orbit_vectors,
     orbital_elements,
     orbital_reward,
     penalties,
     precision_points,
+    refuse_unless,
     specific_energy,
     target_axes,
     target_orbit,
@@ -437,11 +448,13 @@ class SingleEnv(gym.Env):
         self.observation_space, self.action_space = batch.single_observation_space, batch.single_action_space
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
-        """Start anew, `options={"x0": (2,)}` from a given state; returns the observation and an empty info."""
+        """Start anew, `options` being the batch's without its first axis; returns the observation and an empty info."""
         super().reset(seed=seed)
         self._running = False  # also where the options are refused
         if options and "x0" in options:
             options = {**options, "x0": np.asarray(options["x0"])[None]}
+        if options and "draw" in options:
+            options = {**options, "draw": [options["draw"]]}
         obs, info = self.batch.reset(seed=seed, options=options)
         self._running = True
         return obs[0], info
@@ -519,14 +532,22 @@ class RocketVectorEnv(BatchedEnv):
     at the step's start, then held in ECI. A step is one RK4 step between events: staging, a stage that runs dry
     (`table_isp`), the end of the episode.
 
+    With `dispersion` k > 0 no flight is like another: each episode draws standard scores, clipped at +-3 (see
+    `draw_bounds`), in the order of `draw_names`, and flies the vehicle of `draw_vehicles`, k times `DISPERSION` from
+    the nominal one. `reset(options={"draw": z})`, z (N, k), gives them, also beyond 3; BadInput refuses what no vehicle
+    can be. Events and phases are then each flight's own. The mass that is observed is the flight computer's: the
+    nominal schedule from the last staging on; `observe_mass` shows the true one. `observe_draw` puts the scores behind
+    the nine.
+
     With a `cutoff` mission (ours: the paper fixes the final time) the engine stops when, in the last phase, the energy
     reaches the target's: the root within the step, to 1e-10, ends the episode. An altitude below 0 ends it too (crash),
-    and so does `end_time`.
+    and so does `end_time`; with dispersion the burn-out of a flight's own last stage does in its place, and t_norm may
+    end below 0 (unless `end_time` is another than the rocket's, or that one before the last burn's end).
 
     Reward: the sum of the five parts R_orbital, R_trajectory, R_guidance, R_penalties and R_terminal, each a function
     of `rocket.py`. `final_info`, (N,) each: `error_norm` (and `error` (N, 6), the terminal error in ECI), `a_km e i_deg
     raan_deg argp_deg final_mass_kg final_time_s max_altitude_km` (at the steps' ends), the parts' sums,
-    `episodic_return`, `points` (`precision_points`), `crashed`.
+    `episodic_return`, `points` (`precision_points`), `crashed`, with dispersion `draw` (N, k).
 
     Attributes that only training changes, to be set before a `reset`: `mass_weight`, `trajectory_weight`,
     `guidance_weight`, `guidance` (a key of `REFERENCE_PITCH`), `end_time` (s, at most the last phase's end) and
@@ -544,74 +565,129 @@ class RocketVectorEnv(BatchedEnv):
         table_isp: bool = False,
         observe_phase: bool = True,
         render_mode: str | None = None,
+        dispersion: float = 0.0,
+        observe_draw: bool = False,
+        observe_mass: bool = False,
     ):
         if action_frame not in ACTION_FRAMES:
             raise ValueError(f"action_frame is {action_frame!r}; it must be one of {', '.join(ACTION_FRAMES)}")
+        number = isinstance(dispersion, int | float | np.number) and 0 <= dispersion <= LARGEST_DISPERSION
+        refuse_unless(number, "dispersion", dispersion, f"must be a number from 0 to {LARGEST_DISPERSION:.0f}")
         self.mission = flown_mission(mission, table_isp=table_isp)
         self.rocket, self.cutoff = self.mission.rocket, mission.cutoff
         self._last_phase = len(self.rocket.burns) - 1
-        self._propellant = sum(n * engine.propellant for n, engine in self.rocket.burns[-1].engines)  # the last stage's
         self.action_frame, self.observe_phase = action_frame, observe_phase
+        self.dispersion, self.observe_draw, self.observe_mass = dispersion, observe_draw, observe_mass
         self.mass_weight, self.trajectory_weight, self.guidance_weight, self.guidance = 0.0, 0.0, 0.1, "none"
         self.terminal_scale = TERMINAL_SCALE
-        x0 = self.rocket.x0
-        r_max, v_max = reachable(self.rocket)
-        high = np.array([*[r_max] * 3, *[v_max] * 3, x0[-1], 1.0, 1.0])
-        low = np.array([*-high[:6], 0.0, 0.0, 0.0])
-        spaces = Box(low, high, dtype=np.float64), Box(-1.0, 1.0, (3,), dtype=np.float64)
-        super().__init__(num_envs, 1, *spaces, render_mode)
+        self._build(num_envs)
+        super().__init__(num_envs, 1, *self._spaces(), render_mode)
         self.end_time = self.rocket.end_time  # sets episode_steps, too
         self._axes = target_axes(self.rocket)
         h, e = target_orbit(self.rocket.target, self.rocket.mu)
         self._h_axes = self._axes / np.linalg.norm(h)
         self._target = np.concatenate([self._h_axes @ h, self._axes @ e])[:, None]
-        self.y = np.repeat(x0[:, None], num_envs, axis=1)  # (7, N)
+        self.y = np.repeat(self.rocket.x0[:, None], num_envs, axis=1)  # (7, N)
         self.u = np.zeros((3, num_envs))  # the direction of the step before, in ECI
         self._parts = np.zeros((len(self.PARTS), num_envs))
         self._distance, self._energy, self.time, self._max_altitude = np.zeros((4, num_envs))
+        self._phase, self._arc_index = np.zeros(
+            (2, num_envs), dtype=np.int64
+        )  # a step's phase; an arc is a burn or less
         self._crashed = np.zeros(num_envs, dtype=bool)
+        self._everyone = np.arange(num_envs)
+
+    def _build(self, num_envs):
+        """The vehicles: all alike until an episode draws its own."""
+        self.draw = np.zeros((num_envs, len(draw_names(self.rocket))))
+        self._draw_bounds = draw_bounds(self.rocket, self.dispersion)
+        self.vehicles = nominal_vehicles(self.rocket, num_envs)
+        self._largest = self.vehicles  # of all that may be drawn
+        if self.dispersion:
+            self.vehicles = draw_vehicles(self.rocket, self.dispersion, self.draw)
+            self._largest = draw_vehicles(self.rocket, self.dispersion, largest_draw(self.rocket, self.dispersion))
+            # of the flight computer: by burn the nominal mass at its beginning and the flow
+            ends, flow, dropped = (getattr(self.vehicles, name)[:-1, 0] for name in ("end", "flow", "dropped"))
+            burnt = flow[:-1] * np.diff(ends[:-1], prepend=0.0)
+            self._seen_mass = self.vehicles.mass[0] - np.append(0.0, np.cumsum(burnt + dropped[:-1]))
+            self._seen_flow = flow.copy()  # drawn flows will be written where it lies
+
+    def _spaces(self):
+        """The spaces of one environment."""
+        r_max, v_max = reachable(self.rocket, self.dispersion)
+        scores = self._draw_bounds if self.observe_draw else []
+        latest = max(self._largest.burn_out.max(), self.rocket.end_time)
+        high = np.array([*[r_max] * 3, *[v_max] * 3, self._largest.mass[0], 1.0, 1.0, *scores])
+        low = -high
+        low[6:9] = 0.0, min(0.0, 1 - latest / self.rocket.end_time) if self.dispersion else 0.0, 0.0
+        return Box(low, high, dtype=np.float64), Box(-1.0, 1.0, (3,), dtype=np.float64)
 
     @property
     def end_time(self) -> float:
         """Seconds after which an episode ends at the latest; the last step is shorter where 2 s do not divide it."""
-        return float(self._grid[-1])
+        return self._end_time
 
     @end_time.setter
     def end_time(self, value: float):
         if not 0 < value <= self.rocket.end_time:
             raise ValueError(f"end_time is {value} s; it must be positive and at most {self.rocket.end_time}")
-        self.episode_steps = max(int(np.ceil(value / self.rocket.dt - 1e-9)), 1)
-        self._grid = np.append(self.rocket.dt * np.arange(self.episode_steps), float(value))
-        self._tabulate()
+        self._end_time = float(value)
+        self.episode_steps = int(self._set_ends(self._largest).max())
+        self._set_ends(self.vehicles)
 
-    def _tabulate(self):
-        """The arcs by step. A step has up to two, `first` and `last`, with an event between them."""
-        arcs, begin, end = np.array(self.rocket.arcs()), self._grid[:-1], self._grid[1:]
-        first, last = (np.searchsorted(arcs[:, 1], time, side="right").clip(max=len(arcs) - 1) for time in (begin, end))
-        if (last - first).max() > 1:
-            raise ValueError(f"two events fall into one step of {self.rocket.dt} s")
-        self._event = first < last  # (steps,)
-        self._until_event = np.where(self._event, arcs[first, 1], end) - begin  # (steps,) s
-        self._thrust, self._flow = (arcs[np.stack([first, last]), column] for column in (2, 3))  # (2, steps)
-        self._dropped = arcs[first, 4] * self._event  # (steps,) kg
-        phase_ends = [burn.end for burn in self.rocket.burns[:-1]]
-        self._phase = np.searchsorted(phase_ends, self._grid, side="right")  # (steps + 1,), 0-based
-        phase = np.append(self._phase[:-1], self._phase[-2])  # the last entry is seen at the end
-        phase = phase / max(self._last_phase, 1)
-        self._clock = np.column_stack([1 - self._grid / self.rocket.end_time, phase]) * self.observe_phase
+    def _set_ends(self, vehicles):
+        """When the episodes of these vehicles end at the latest: sets and returns the number of their steps."""
+        own = self.dispersion and self.cutoff and self._end_time == self.rocket.end_time == self.rocket.burns[-1].end
+        self._latest = vehicles.burn_out if own else np.full(len(vehicles.mass), self._end_time)  # s
+        self._steps = np.maximum(np.ceil(self._latest / self.rocket.dt - 1e-9), 1.0).astype(np.int64)
+        return self._steps
 
     def _start(self, mask, options):
-        if options:
-            raise ValueError(f"reset options are {options!r}; a rocket has one start and no options")
+        if options and not (self.dispersion and options.keys() == {"draw"}):
+            raise BadInput(f"reset options are {options!r}; {self._allowed_options()}")
         if self.guidance not in REFERENCE_PITCH:
             raise ValueError(f"guidance is {self.guidance!r}; it must be one of {', '.join(REFERENCE_PITCH)}")
         if not 0 < self.terminal_scale < np.inf:
             raise ValueError(f"terminal_scale is {self.terminal_scale}; it must be positive and finite")
+        if self.dispersion:
+            self._launch(mask, options.get("draw"))
         self.y[:, mask] = self.rocket.x0[:, None]
+        self.y[6, mask] = self.vehicles.mass[mask]
         self._parts[:, mask] = self.u[:, mask] = 0.0
         self._max_altitude[mask] = self.time[mask] = 0.0
+        self._phase[mask] = self._arc_index[mask] = 0
         distance, energy = self._progress()
         self._distance[mask], self._energy[mask] = distance[mask], energy[mask]
+
+    def _allowed_options(self):
+        return (
+            "the only one is 'draw'" if self.dispersion else "a rocket has one start and no options but with dispersion"
+        )
+
+    def _launch(self, mask, given):
+        """Vehicles for the environments in `mask`: of the given draws (N, k), else of their own."""
+        if given is None:
+            draw = self.np_random.standard_normal((int(mask.sum()), self.draw.shape[1]))
+            draw = np.clip(draw, -self._draw_bounds, self._draw_bounds)
+        else:
+            draw = self._checked_draw(given)[mask]
+        drawn = draw_vehicles(self.rocket, self.dispersion, draw)  # before anything is changed: it may be refused
+        self.draw[mask] = draw
+        for mine, new in zip(self.vehicles, drawn):
+            mine[..., mask] = new
+        self.episode_steps = max(self.episode_steps, int(self._set_ends(self.vehicles).max()))
+
+    def _checked_draw(self, given):
+        """The draws of `reset` (N, k), float64; BadInput where they are none."""
+        allowed = f"must hold finite numbers, of shape {self.draw.shape}: {', '.join(draw_names(self.rocket))}"
+        try:
+            draw = np.array(given, dtype=np.float64)
+        except (TypeError, ValueError):
+            draw = np.empty(0)
+        refuse_unless(draw.shape == self.draw.shape, "options['draw']", f"of shape {draw.shape}", allowed)
+        bad = draw[~np.isfinite(draw)]
+        refuse_unless(not len(bad), "an entry of options['draw']", bad[:1].sum(), allowed)
+        return draw
 
     def _progress(self):
         """The distance L to the target orbit (see `orbital_reward`) and the specific energy, both (N,)."""
@@ -620,9 +696,25 @@ class RocketVectorEnv(BatchedEnv):
         return np.abs(error).sum(axis=0), specific_energy(self.y, self.rocket.mu)
 
     def _observe(self):
-        obs = np.empty((self.num_envs, 9))
-        obs[:, :7], obs[:, 7:] = self.y.T, self._clock[self.t]
+        obs = np.empty((self.num_envs, 9 + self.observe_draw * self.draw.shape[1]))
+        obs[:, :7], obs[:, 9:] = self.y.T, self.draw[:, : obs.shape[1] - 9]
+        if self.dispersion and not self.observe_mass:
+            obs[:, 6] = self._computed_mass()
+        time = np.where(self.t == self._steps, self._latest, self.rocket.dt * self.t)
+        obs[:, 7] = (1 - time / self.rocket.end_time) * self.observe_phase
+        obs[:, 8] = self._phase / max(self._last_phase, 1) * self.observe_phase
         return obs
+
+    def _computed_mass(self):
+        """The flight computer's mass (N,) in kg: the nominal burn's, counted from the staging that has just been."""
+        burn = np.minimum(self._arc_index, self._last_phase)
+        began = np.where(burn > 0, self.vehicles.end[burn - 1, self._everyone], 0.0)
+        return np.maximum(self._seen_mass[burn] - self._seen_flow[burn] * (self.time - began), self.rocket.dry_mass)
+
+    def _phase_at(self, t):
+        """The phases (N,), 0-based, in which the steps t begin; behind an episode's last step it is that one's."""
+        begin = self.rocket.dt * np.minimum(t, self._steps - 1)
+        return (self.vehicles.end[: self._last_phase] <= begin).sum(axis=0)
 
     def _directions(self, actions):
         """Unit thrust directions in ECI (3, N) of actions (N, 3); BadInput names the first of length zero."""
@@ -639,71 +731,84 @@ class RocketVectorEnv(BatchedEnv):
 
     def _advance(self, actions):
         t, u, before = self.t, self._directions(actions), self.y
-        duration = self._grid[t + 1] - self._grid[t]
-        self.y = self._fly(before, u, t, duration)
-        done = t + 1 == self.episode_steps
+        begin = self.rocket.dt * t
+        done = t + 1 == self._steps
+        duration = np.where(done, self._latest, self.rocket.dt * (t + 1)) - begin
+        self.y, arc = self._fly(before, u, begin, duration, self._everyone, self._arc_index)
         if self.cutoff:
             energy = specific_energy(self.y, self.rocket.mu)
-            reached = (self._phase[t] == self._last_phase) & (energy >= self.rocket.target_energy)
+            reached = (self._phase == self._last_phase) & (energy >= self.rocket.target_energy)
             if reached.any():
-                self.y[:, reached], duration[reached] = self._cut(before, u, t, duration, reached)
+                self.y[:, reached], duration[reached] = self._cut(before, u, begin, duration, np.flatnonzero(reached))
             done = done | reached
         altitude = np.sqrt((self.y[:3] ** 2).sum(axis=0)) - self.rocket.Re
         self._crashed = altitude < 0
         done = done | self._crashed
-        self.time = self._grid[t] + duration
+        self.time = begin + duration
         self._max_altitude = np.maximum(self._max_altitude, altitude)
         rewards = self._reward(before, u, altitude, done)
-        self.u, self.t = u, t + 1
+        self.u, self.t, self._arc_index = u, t + 1, arc
+        self._phase = self._phase_at(self.t)
         return rewards, done, self._final_info
 
-    def _fly(self, y, u, t, duration):
-        """States (7, n) after `duration` (n,) seconds of the steps t (n,) from y (7, n), u (3, n) held."""
-        first = np.minimum(duration, self._until_event[t])
-        y = self._arc(y, u, first, self._thrust[0, t], self._flow[0, t])
-        passed = np.flatnonzero(self._event[t] & (duration >= self._until_event[t]))
-        if len(passed):
-            y[6, passed] -= self._dropped[t[passed]]
-            rest, thrust, flow = duration[passed] - first[passed], self._thrust[1, t[passed]], self._flow[1, t[passed]]
-            y[:, passed] = self._arc(y[:, passed], u[:, passed], rest, thrust, flow)
-        return y
+    def _fly(self, y, u, begin, duration, who, arc):
+        """States (7, n) `duration` s after `begin` (n,), u (3, n) held, and the arcs (n,) they are then in.
 
-    def _arc(self, y, u, dt, thrust, flow):
+        y (7, n): states of the environments `who` (n,), in the arcs `arc` (n,) at `begin`.
+        """
+        event = self.vehicles.end[arc, who]
+        until = event - begin
+        thrust, flow = self.vehicles.thrust[arc, who], self.vehicles.flow[arc, who]
+        y = self._arc(y, u, np.minimum(duration, until), who, thrust, flow)
+        passed = np.flatnonzero(duration >= until)
+        if len(passed):
+            arc, late, gone = arc.copy(), (duration - until)[passed], who[passed]
+            y[6, passed] -= self.vehicles.dropped[arc[passed], gone]
+            flown = self._fly(y[:, passed], u[:, passed], event[passed], late, gone, arc[passed] + 1)
+            y[:, passed], arc[passed] = flown
+        return y, arc
+
+    def _arc(self, y, u, dt, who, thrust, flow):
         """States (7, n) after dt (n,) seconds without an event: one RK4 step, several for a plunge into dense air.
 
         There drag is stiff: its rate times the step, at the lowest altitude that the step can reach, is kept below
         `STIFF`. No ascent comes near it; without this a crash at orbital speed would end in numbers without meaning.
         """
         rocket, controls = self.rocket, (*u, thrust, flow)
+        drag, wind = (self.vehicles.drag[who], self.vehicles.wind[:, who]) if self.dispersion else (None, None)
         # the state as one component (7, n): rk4 then takes a seventh of the array operations
-        f = lambda x, u: (np.array(ascent(x[0], u, rocket)),)  # noqa: E731
+        f = lambda x, u: (np.array(ascent(x[0], u, rocket, wind, drag)),)  # noqa: E731
         speed = np.sqrt((y[3:6] ** 2).sum(axis=0))
         lowest = np.maximum(np.sqrt((y[:3] ** 2).sum(axis=0)) - rocket.Re - speed * dt, 0.0)
         rate = rocket.rho0 * np.exp(-lowest / rocket.H) * rocket.Cd * rocket.S * speed / y[6]
+        if self.dispersion:
+            rate = drag * rate
         (y_next,) = rk4(f, (y,), controls, dt)
         stiff = np.flatnonzero(rate * dt > STIFF)
         if len(stiff):
             n = np.ceil((rate * dt)[stiff] / STIFF)  # for each its own: it must not depend on the rest of the batch
             y_sub, controls, dt = y[:, stiff], tuple(c[stiff] for c in controls), dt[stiff] / n
+            if self.dispersion:
+                drag, wind = drag[stiff], wind[:, stiff]
             for k in range(int(n.max())):
                 aloft = (y_sub[:3] ** 2).sum(axis=0) >= rocket.Re**2  # who is below the ground stays there
                 y_sub = np.where(aloft & (k < n), rk4(f, (y_sub,), controls, dt)[0], y_sub)
             y_next[:, stiff] = y_sub
         return y_next
 
-    def _cut(self, before, u, t, duration, reached):
+    def _cut(self, before, u, begin, duration, reached):
         """States (7, n) and times (n,) within the step at which those who `reached` the target's energy have just it.
 
         Regula falsi with the Illinois change (Dowell and Jarratt, 1971). The energy grows almost linearly in a step, so
         that four evaluations reach rounding; six, for all alike, keep a row independent of the rest of the batch.
         """
-        before, u, t, goal = before[:, reached], u[:, reached], t[reached], self.rocket.target_energy
-        low, high, above = np.zeros(len(t)), duration[reached], np.full(len(t), -1)
+        before, u, begin, goal = before[:, reached], u[:, reached], begin[reached], self.rocket.target_energy
+        low, high, above = np.zeros(len(reached)), duration[reached], np.full(len(reached), -1)
         f_low = np.minimum(specific_energy(before, self.rocket.mu) - goal, -1e-300)  # beyond it at the start: cut there
         f_high = specific_energy(self.y[:, reached], self.rocket.mu) - goal
         for _ in range(6):
             time = low - f_low * (high - low) / (f_high - f_low)
-            y = self._fly(before, u, t, time)
+            y, _ = self._fly(before, u, begin, time, reached, self._arc_index[reached])
             f, above_before = specific_energy(y, self.rocket.mu) - goal, above
             above = f >= 0
             kept = above == above_before  # the same end twice: its value is halved
@@ -714,7 +819,7 @@ class RocketVectorEnv(BatchedEnv):
     def _reward(self, before, u, altitude, done):
         """The five parts of this step, added to their sums; returns what is paid, (N,): their total, R_terminal with
         `terminal_scale`."""
-        t, phase = self.t, self._phase[self.t]
+        t, phase = self.t, self._phase
         distance, energy = self._progress()
         turn = np.sqrt(((u - self.u) ** 2).sum(axis=0)) * (t > 0)
         burnt = (before[6] - self.y[6]) * (phase == self._last_phase)
@@ -724,9 +829,9 @@ class RocketVectorEnv(BatchedEnv):
         if REFERENCE_PITCH[self.guidance] is not None:
             until = self.mission.guided_until or self.rocket.burns[0].end
             times, angles = REFERENCE_PITCH[self.guidance]
-            pitch = np.radians(np.interp(self._grid[t], until * np.array(times), angles, right=np.nan))
+            pitch = np.radians(np.interp(self.rocket.dt * t, until * np.array(times), angles, right=np.nan))
             parts[2] = guidance_reward(u, *local_frame(before, self._axes[2])[:2], pitch, self.guidance_weight)
-        left = np.minimum(self.y[6] - self.rocket.dry_mass, self._propellant)
+        left = np.minimum(self.y[6] - self.vehicles.dry_mass, self.vehicles.propellant)
         parts[3] = penalties(self.mission, altitude, self.time, turn, burnt, left, self.mass_weight)
         self._parts += parts
         if done.any():
@@ -744,6 +849,7 @@ class RocketVectorEnv(BatchedEnv):
         info |= {f"{name}_deg": np.degrees(getattr(elements, name)) for name in ("i", "raan", "argp")}
         info |= {"final_mass_kg": self.y[6].copy(), "final_time_s": self.time.copy(), "crashed": self._crashed.copy()}
         info |= {"max_altitude_km": self._max_altitude / 1e3, "points": precision_points(error_norm)}
+        info |= {"draw": self.draw.copy()} if self.dispersion else {}
         return info | dict(zip(self.PARTS, self._parts.copy())) | {"episodic_return": self._parts.sum(axis=0)}
 
     def _snapshot(self):
@@ -753,10 +859,24 @@ class RocketVectorEnv(BatchedEnv):
         return animation.Ascent(self.rocket)
 
 
-def reachable(rocket: Rocket) -> tuple[float, float]:
-    """Bounds of |r| (m) and |v| (m/s): the launcher's delta-v and gravity all pointing one way, the whole flight."""
-    v_max = np.linalg.norm(rocket.x0[3:6]) + delta_v(rocket) + rocket.mu / rocket.Re**2 * rocket.end_time
-    return rocket.Re + v_max * rocket.end_time, v_max
+def reachable(rocket: Rocket, dispersion: float = 0.0) -> tuple[float, float]:
+    """Bounds of |r| (m) and |v| (m/s): the launcher's delta-v and gravity all pointing one way, the whole flight.
+
+    With dispersion the delta-v is bounded by one stage's with the fastest exhaust, the heaviest start and the lightest
+    end.
+    """
+    gain, end = delta_v(rocket), rocket.end_time
+    if dispersion:
+        draw = largest_draw(rocket, dispersion)
+        scores = dict(zip(draw_names(rocket), draw_bounds(rocket, dispersion)))
+        heavy, light = draw_vehicles(rocket, dispersion, draw), draw_vehicles(rocket, dispersion, -draw)
+        engines = [(e.thrust, e.flow(rocket.table_isp)) for burn in rocket.burns for _, e in burn.engines]
+        fastest = max((thrust / flow for thrust, flow in engines if flow), default=0.0)
+        gain = fastest * (1 + dispersion * DISPERSION.isp * scores["isp_1"])
+        gain *= np.log(heavy.mass[0] / light.dry_mass[0])
+        end = max(end, heavy.burn_out[0])
+    v_max = np.linalg.norm(rocket.x0[3:6]) + gain + rocket.mu / rocket.Re**2 * end
+    return rocket.Re + v_max * end, v_max
 
 
 class RocketEnv(SingleEnv):
@@ -768,6 +888,7 @@ class RocketEnv(SingleEnv):
     guidance = of_batch("guidance", "The reference pitch of R_guidance, a key of REFERENCE_PITCH.")
     end_time = of_batch("end_time", "Seconds after which an episode ends at the latest.")
     terminal_scale = of_batch("terminal_scale", "The scale of R_terminal in the reward; reports keep TERMINAL_SCALE.")
+    draw = of_batch("draw", "The running episode's standard scores (1, k), zeros without dispersion.")
 
 
 def flown_mission(mission: Mission, rocket: Rocket | None = None, table_isp: bool = False) -> Mission:
@@ -786,21 +907,23 @@ def make_rocket(env_id: str, **options) -> RocketEnv:
     return RocketEnv(make_rocket_vector(env_id, **options))
 
 
-def fly_rocket(env_id: str, policy: Callable, end_time: float | None = None, **options) -> dict:
+def fly_rocket(env_id: str, policy: Callable, end_time: float | None = None, draw=None, **options) -> dict:
     """Fly `policy(obs (1, obs), t) -> action (1, 3)` once, to `end_time` (s) at the latest, and record what happened.
+
+    draw (k,): the vehicle's standard scores, with the option `dispersion`.
 
     Returns t (K+1,) s, u (K, 3) the unit directions in ECI, y (K+1, 7) r, v, m, reward (K,), and the last step's info.
     """
     env = gym.make_vec(env_id, num_envs=1, **options)
     if end_time is not None:
         env.end_time = end_time
-    obs, _ = env.reset()
-    t, u, y, rewards, final = [0.0], [], [obs[0, :7]], [], {}
+    obs, _ = env.reset(options=None if draw is None else {"draw": [draw]})
+    t, u, y, rewards, final = [0.0], [], [env.y[:, 0].copy()], [], {}
     while not final:
         obs, reward, _, final = env.advance(policy(obs, len(u)))
         t.append(env.time[0])
         u.append(env.u[:, 0])
-        y.append(obs[0, :7])
+        y.append(env.y[:, 0].copy())
         rewards.append(reward[0])
     final = {key: value[0] for key, value in final.items()}
     return {"t": np.array(t), "u": np.array(u), "y": np.array(y), "reward": np.array(rewards), **final}

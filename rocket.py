@@ -1,9 +1,10 @@
 """Rockets without any environment: vehicle, Earth and target orbit, equations of motion, orbits, rewards.
 
-Reading order: the tables (`Engine`, `Burn`, `Rocket`; `ROCKET` is the paper's), what cannot fly, the missions, the
-equations of motion (`ascent`), the geometry of orbits, the five parts of the reward. Functions of a state without
-memory; nothing is imported but NumPy, and `ascent`, `orbit_vectors` and `specific_energy` take CasADi symbols, too.
-`RocketVectorEnv` in `envs.py` flies them: time grid, events, RK4, cutoff. Every name here is also one of `envs`.
+Reading order: the tables (`Engine`, `Burn`, `Rocket`; `ROCKET` is the paper's), what cannot fly, the missions, what
+differs from flight to flight (`Dispersion`), the equations of motion (`ascent`), the geometry of orbits, the five parts
+of the reward. Functions of a state without memory; nothing is imported but NumPy, and `ascent`, `orbit_vectors` and
+`specific_energy` take CasADi symbols, too. `RocketVectorEnv` in `envs.py` flies them: time grid, events, RK4, cutoff.
+Every name here is also one of `envs`.
 """
 
 from __future__ import annotations
@@ -300,29 +301,248 @@ def launch_raan(latitude: float, i: float) -> float:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
+# What differs from flight to flight: a draw is a vector of standard scores, in the order of `draw_names`
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Dispersion:
+    """Standard deviations of a flight's differences from the table: relative ones, kg and m/s.
+
+    The studies named are quoted from memory and were not looked up again; "ours" is nobody else's number. A public
+    Monte-Carlo study of launch guidance has thrust 1 %, Isp 0.3 %, propellant and dry mass 0.5 %, density 5 %; one of
+    the Saturn V with 10 000 trials Isp 0.3 %, thrust 0.4 %.
+    """
+
+    burn_rate: float = 0.005  # thrust and flow together: between the studies' 0.4 % and 1 %
+    isp: float = 0.003  # thrust at a given flow: both studies'
+    propellant: float = 0.003  # load: ours, below the study's 0.5 %, for the burn rate moves the burn-out, too
+    dry_mass: float = 0.005  # the study's
+    payload: float = 20.0  # kg: ours, the study's 0.5 % of the paper's payload
+    drag: float = 0.14  # density times Cd: the study's 5 % of density and, ours, 13 % of Cd
+    wind: float = 20.0  # m/s at its altitude, east and north each: ours, the jet stream from day to day
+
+
+DISPERSION = Dispersion()
+OF_ENGINES = ("burn_rate", "isp", "propellant", "dry_mass")  # one score each for every type of engine
+OF_FLIGHT = ("payload", "drag", "wind_east", "wind_north")
+LARGEST_SCORE = 3.0  # drawn scores are clipped there
+LARGEST_CHANGE = 0.9  # part of its nominal value by which a drawn factor or payload may differ: nothing vanishes
+LARGEST_DISPERSION = 100.0
+WIND_ALTITUDE, WIND_DEPTH = 12e3, 5e3  # m, of the profile exp(-((h - altitude) / depth)^2): ours
+
+
+class Vehicles(NamedTuple):
+    """N vehicles as they were drawn, arcs as in `Rocket.arcs` (A of them): what is constant between events."""
+
+    mass: np.ndarray  # (N,) kg at lift-off
+    dry_mass: np.ndarray  # (N,) kg, as `Rocket.dry_mass`
+    propellant: np.ndarray  # (N,) kg in the last stage
+    end: np.ndarray  # (A, N) s, the last infinite; the first ones are the ends of all burns but the last
+    thrust: np.ndarray  # (A, N) N
+    flow: np.ndarray  # (A, N) kg/s
+    dropped: np.ndarray  # (A, N) kg at the arc's end
+    burn_out: np.ndarray  # (N,) s: when the last stage has burnt what the nominal one burns, or runs dry
+    wind: np.ndarray  # (2, N) m/s, towards east and north where the profile is 1
+    drag: np.ndarray  # (N,) factor on the drag
+
+
+class Group(NamedTuple):
+    """Engines of one type that are dropped together, or are the last stage's."""
+
+    number: int
+    engine: Engine
+    type: int  # index in `engine_types`
+    dropped: int  # the burn at whose end
+    lit: tuple[int, ...]  # the burns in which they burn
+    part: float  # s that each of them nominally burns
+    full: float  # s for which its nominal propellant lasts, infinite without a flow
+
+
+def engine_types(rocket: Rocket) -> tuple[Engine, ...]:
+    """The distinct engines in order of first ignition; behind them what is dropped without ever being lit."""
+    lit = [engine for burn in rocket.burns for _, engine in burn.engines]
+    return tuple(dict.fromkeys([*lit, *(engine for burn in rocket.burns for _, engine in burn.dropped)]))
+
+
+def draw_names(rocket: Rocket) -> tuple[str, ...]:
+    """What the k scores of a draw are of; types of engines are counted from 1."""
+    types = range(1, len(engine_types(rocket)) + 1)
+    return (*(f"{name}_{j}" for name in OF_ENGINES for j in types), *OF_FLIGHT)
+
+
+DRAW = draw_names(ROCKET)
+
+
+def draw_sigmas(rocket: Rocket) -> np.ndarray:
+    """(k,): the entry of `DISPERSION` for each score."""
+    table = {**vars(DISPERSION), "wind_east": DISPERSION.wind, "wind_north": DISPERSION.wind}
+    return np.array([table[name if name in table else name.rpartition("_")[0]] for name in draw_names(rocket)])
+
+
+def draw_bounds(rocket: Rocket, dispersion: float) -> np.ndarray:
+    """(k,): the largest score that is drawn: 3, less where a factor or the payload would change by more than 90 %."""
+    nominal = np.ones(len(draw_names(rocket)))
+    nominal[-4:] = rocket.payload, 1.0, np.inf, np.inf
+    sigmas = dispersion * draw_sigmas(rocket)
+    bounds = np.full(len(nominal), LARGEST_SCORE)
+    return np.minimum(bounds, np.divide(LARGEST_CHANGE * nominal, sigmas, out=bounds.copy(), where=sigmas > 0))
+
+
+def largest_draw(rocket: Rocket, dispersion: float) -> np.ndarray:
+    """(1, k): the draw of the vehicle that burns longest and is heaviest."""
+    types = len(engine_types(rocket))
+    signs = np.zeros(len(draw_names(rocket)))
+    signs[:types], signs[2 * types : 4 * types + 1] = -1.0, 1.0
+    return (signs * draw_bounds(rocket, dispersion))[None]
+
+
+def engine_groups(rocket: Rocket) -> tuple[Group, ...]:
+    """The groups in the order in which they leave, the last stage's at the end.
+
+    A group is lit in the burns of its engine back to where no more of them burn than are dropped: what burnt before
+    was another group.
+    """
+    starts = [0.0, *(burn.end for burn in rocket.burns)]
+    count = lambda parts, engine: sum(n for n, other in parts if other == engine)  # noqa: E731
+    groups, last = [], len(rocket.burns) - 1
+    for k, burn in enumerate(rocket.burns):
+        for number, engine in burn.engines if k == last else burn.dropped:
+            lit = []
+            for j in range(k, -1, -1):
+                burning = count(rocket.burns[j].engines, engine)
+                if j < k and 0 < burning <= count(rocket.burns[j].dropped, engine):
+                    break
+                lit += [j] if burning else []
+            flow, part = engine.flow(rocket.table_isp), sum(rocket.burns[j].end - starts[j] for j in lit)
+            full = engine.propellant / flow if flow else np.inf
+            type_ = engine_types(rocket).index(engine)
+            groups.append(Group(number, engine, type_, k, tuple(lit), part, full))
+    return tuple(groups)
+
+
+def draw_values(rocket: Rocket, dispersion: float, draw: np.ndarray):
+    """Factors (4, types, N) in the order of `OF_ENGINES`, payload (N,) kg, factor on the drag (N,), wind (2, N) m/s.
+
+    draw: scores (N, k). Raises BadInput for the first that no vehicle can have.
+    """
+    types = len(engine_types(rocket))
+    change = dispersion * draw_sigmas(rocket)[:, None] * draw.T
+    value = change + 1.0
+    value[-4], value[-2:] = change[-4] + rocket.payload, change[-2:]
+    possible = value > 0
+    possible[-4], possible[-2:] = value[-4] >= 0, True
+    if not possible.all():
+        k, n = np.argwhere(~possible)[0]
+        allowed = f"must be larger: with dispersion {dispersion} it makes of the nominal value {value[k, n]:.6g}"
+        refuse_unless(False, f"{draw_names(rocket)[k]} of draw {n}", draw[n, k], allowed)
+    return value[: 4 * types].reshape(4, types, -1), value[-4], value[-3], value[-2:]
+
+
+def draw_vehicles(rocket: Rocket, dispersion: float, draw: np.ndarray) -> Vehicles:
+    """The vehicles of N draws (N, k): each value is the nominal one changed by dispersion times sigma times score.
+
+    Arcs are the burns, and a last one without thrust. What is loaded is burnt or dropped, also what an engine keeps
+    that uses a part of its propellant. Raises BadInput for a draw that no vehicle can have.
+    """
+    (rate, isp, load, dry), payload, drag, wind = draw_values(rocket, dispersion, np.asarray(draw, dtype=np.float64))
+    of = engine_types(rocket).index
+    empty = lambda parts: sum(n * (e.total_mass - e.propellant) * dry[of(e)] for n, e in parts)  # noqa: E731
+    full = lambda parts: sum(n * e.propellant * load[of(e)] for n, e in parts)  # noqa: E731
+    last = rocket.burns[-1].engines
+    parts = [*(part for burn in rocket.burns for part in burn.dropped), *last]
+    end, burn_out, seconds = burn_ends(rocket, load / rate)
+    none, dropped = np.zeros_like(payload), np.zeros_like(end)
+    for group, lit in zip(engine_groups(rocket), seconds):
+        if group.dropped < len(rocket.burns) - 1:
+            burnt = group.engine.flow(rocket.table_isp) * rate[group.type] * lit
+            residual = np.maximum(group.engine.propellant * load[group.type] - burnt, 0.0)
+            dropped[group.dropped] += empty([(group.number, group.engine)]) + group.number * residual
+    thrust, flow = [], []
+    for burn in rocket.burns:
+        thrust.append(sum(n * e.thrust * rate[of(e)] * isp[of(e)] for n, e in burn.engines))
+        flow.append(sum(n * e.flow(rocket.table_isp) * rate[of(e)] for n, e in burn.engines))
+    coast = (np.vstack([end, none + np.inf]), np.array([*thrust, none]), np.array([*flow, none]))
+    mass = payload + empty(parts) + full(parts)
+    return Vehicles(mass, payload + empty(last), full(last), *coast, np.vstack([dropped, none]), burn_out, wind, drag)
+
+
+def burn_ends(rocket: Rocket, lasting: np.ndarray):
+    """Ends of the burns (B, N) s, the last one's when it runs dry; `burn_out` (N,) s; seconds lit of the groups (G, N).
+
+    lasting (types, N): how long an engine's propellant lasts, as a part of the nominal time. A burn that drops burning
+    engines ends when the first of them has burnt as large a part of its propellant as nominally, any other at its
+    nominal time, and none goes on without an engine's propellant.
+    """
+    groups, last = engine_groups(rocket), len(rocket.burns) - 1
+    start, lit = np.zeros(lasting.shape[1]), np.zeros((len(groups), lasting.shape[1]))
+    ends = []
+    for k, burn in enumerate(rocket.burns):
+        limit, due = np.full_like(start, np.inf), np.full_like(start, np.inf)
+        for group, spent in zip(groups, lit):
+            if k in group.lit and np.isfinite(group.full):
+                limit = np.minimum(limit, group.full * lasting[group.type] - spent)
+                if k == group.dropped:
+                    due = np.minimum(due, group.part * lasting[group.type] - spent)
+        due = np.where(np.isfinite(due), due, burn.end - start)
+        first = np.maximum(np.minimum(due, limit), 0.0)
+        ends.append(start + (np.maximum(limit, 0.0) if k == last else first))
+        burn_out, before = start + first, start
+        start = ends[-1]
+        for group, spent in zip(groups, lit):
+            spent += (start - before) * (k in group.lit)
+    return np.array(ends), burn_out, lit
+
+
+def nominal_vehicles(rocket: Rocket, number: int) -> Vehicles:
+    """`number` vehicles just as the table has them; what a stage has not burnt (`table_isp`) stays on board."""
+    _, end, thrust, flow, dropped = np.array(rocket.arcs()).T
+    numbers = [rocket.x0[6], rocket.dry_mass, sum(n * engine.propellant for n, engine in rocket.burns[-1].engines)]
+    columns = [*numbers, np.append(end[:-1], np.inf), thrust, flow, dropped, rocket.burns[-1].end, np.zeros(2), 1.0]
+    return Vehicles(*(np.repeat(np.asarray(column)[..., None], number, axis=-1) for column in columns))
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 # Equations of motion: x is a tuple of components, each a NumPy array over environments or a CasADi symbol
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def ascent(x, u, rocket: Rocket = ROCKET):
+def ascent(x, u, rocket: Rocket = ROCKET, wind=None, drag_factor=None):
     """r' = v, v' = -mu r / |r|^3 + T u / m + D / m, m' = -flow ("Multiphase Rocket Ascent Problem").
 
     D = -1/2 rho Cd S |v_rel| v_rel, rho = rho0 exp(-h / H), v_rel = v - omega_e x r. x: r, v, m by components; u: the
     unit thrust direction by components, thrust T (N) and propellant flow (kg/s). The paper's drag acts "during
     atmospheric phases", this one always: it fades with the density.
+
+    A wind (east, north; m/s where its profile over the altitude is 1) is taken from v_rel, a factor multiplies D.
     """
     rx, ry, rz, vx, vy, vz, m = x
     ux, uy, uz, thrust, flow = u
     r2 = rx * rx + ry * ry + rz * rz
     r = r2**0.5
     gravity, push = -rocket.mu / (r2 * r), thrust / m
-    wx, wy = vx + rocket.omega_e * ry, vy - rocket.omega_e * rx  # v_rel; its third component is vz
+    wx, wy, wz = vx + rocket.omega_e * ry, vy - rocket.omega_e * rx, vz  # v_rel
+    if wind is not None:
+        blow_x, blow_y, blow_z = wind_velocity((rx, ry, rz, r), wind, rocket)
+        wx, wy, wz = wx - blow_x, wy - blow_y, wz - blow_z
     rho = rocket.rho0 * np.exp((rocket.Re - r) / rocket.H)
-    drag = (-0.5 * rocket.Cd * rocket.S) * rho * (wx * wx + wy * wy + vz * vz) ** 0.5 / m
+    if drag_factor is not None:
+        rho = drag_factor * rho
+    drag = (-0.5 * rocket.Cd * rocket.S) * rho * (wx * wx + wy * wy + wz * wz) ** 0.5 / m
     ax = gravity * rx + push * ux + drag * wx
     ay = gravity * ry + push * uy + drag * wy
-    az = gravity * rz + push * uz + drag * vz
+    az = gravity * rz + push * uz + drag * wz
     return vx, vy, vz, ax, ay, az, -flow
+
+
+def wind_velocity(place, wind, rocket: Rocket = ROCKET):
+    """The wind in ECI, m/s by components, at (rx, ry, rz, |r|) in m; wind: (east, north) where the profile is 1."""
+    rx, ry, rz, r = place
+    profile = np.exp(-(((r - (rocket.Re + WIND_ALTITUDE)) / WIND_DEPTH) ** 2))
+    axis = (rx * rx + ry * ry) ** 0.5 + 1e-9  # m from the Earth's axis; over a pole nothing is east, nor NaN
+    east, north = profile * wind[0] / axis, profile * wind[1] / r
+    south = north * rz / axis
+    return -east * ry - south * rx, east * rx - south * ry, north * axis
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -38,10 +38,11 @@ def main():
     parser.add_argument("--num-envs", type=int, default=128)
     parser.add_argument("--seconds", type=float, default=1.0)
     args = parser.parse_args()
-    print(f"{'id':30} {'batch of ' + str(args.num_envs):>14} {'single':>10}   steps/s on one core")
-    for env_id in (*envs.PROBLEMS, *envs.ROCKETS):
+    print(f"{'id':35} {'batch of ' + str(args.num_envs):>14} {'single':>10}   steps/s on one core")
+    rockets = [(env_id, {"action_frame": "local"}) for env_id in envs.ROCKETS]
+    rockets += [(env_id, {**options, "dispersion": 1}) for env_id, options in rockets]
+    for env_id, options in (*((env_id, {}) for env_id in envs.PROBLEMS), *rockets):
         rates, rocket = [], env_id in envs.ROCKETS
-        options = {"action_frame": "local"} if rocket else {}
         batch, single = gym.make_vec(env_id, num_envs=args.num_envs, **options), gym.make(env_id, **options)
         for env, steps in ((batch, args.num_envs), (single, 1)):
             env.reset(seed=0)
@@ -50,7 +51,8 @@ def main():
             if rocket:  # steered at random it falls back to the pad in its first steps
                 action = np.broadcast_to([1.0, 0.3, 0.0], action.shape)
             rates.append(steps_per_second(env, action, steps, args.seconds))
-        print(f"{env_id:30} {rates[0]:14,.0f} {rates[1]:10,.0f}")
+        name = f"{env_id}, dispersed" if "dispersion" in options else env_id
+        print(f"{name:35} {rates[0]:14,.0f} {rates[1]:10,.0f}")
 
 
 if __name__ == "__main__":

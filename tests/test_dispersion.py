@@ -1,0 +1,584 @@
+"""Rockets that differ from flight to flight, against SciPy's integrator with the drawn vehicle typed once more here,
+closed forms of masses and events, and themselves: given against own draws, single against batched.
+"""
+
+import math
+import warnings
+from dataclasses import replace
+from functools import cache
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from scipy.integrate import solve_ivp
+
+import envs
+from envs import DRAW, ROCKET, ROCKETS, BadInput, ascent, fly_rocket
+
+FIXED, CUTOFF, LEO = IDS = ["RocketAscent-v0", "RocketAscentCutoff-v0", "TwoStageLEO-v0"]
+LEO_DRAW = ["burn_rate_1", "burn_rate_2", "isp_1", "isp_2", "propellant_1", "propellant_2", "dry_mass_1", "dry_mass_2"]
+LEO_DRAW += ["payload", "drag", "wind_east", "wind_north"]
+
+# --- a drawn vehicle, typed once more ---------------------------------------------------------------------------------
+
+SIGMAS = {"burn_rate": 0.005, "isp": 0.003, "propellant": 0.003, "dry_mass": 0.005, "drag": 0.14}
+MU, RE, OMEGA = 3.986012e14, 6378145.0, 7.29211585e-5
+# total mass, propellant, thrust, nominal burn time of the types, in order of ignition
+PAPER = [(19290, 17010, 628500, 75.2), (104380, 95550, 1083100, 261.0), (19300, 16820, 110094, 700.0)]
+TWO = [(433e3, 411e3, 7.6e6, 162.0), (111.5e3, 107.5e3, 934e3, 393.0)]
+
+
+def scores(env_id):
+    """A draw with nothing zero: scores by name; the last stage lasts shorter than the nominal one."""
+    names = LEO_DRAW if env_id == LEO else DRAW
+    z = dict(zip(names, np.random.default_rng(3).uniform(0.3, 2.5, len(names)) * (-1.0) ** np.arange(len(names))))
+    last = 2 if env_id == LEO else 3
+    return z | {f"burn_rate_{last}": 0.9, f"propellant_{last}": -1.1, "burn_rate_1": -1.2, "propellant_1": 1.4}
+
+
+def typed(env_id, z):
+    """Of a draw: mass at lift-off, rows of start, end, thrust, flow and kg dropped, factor on the drag, wind."""
+    factor = lambda name, j=None: 1 + SIGMAS[name] * z[name if j is None else f"{name}_{j + 1}"]  # noqa: E731
+    engines = []  # of each type: dry mass, load, thrust, flow, burn time
+    for j, (total, load, thrust, duration) in enumerate(TWO if env_id == LEO else PAPER):
+        b, s, p, d = (factor(name, j) for name in ("burn_rate", "isp", "propellant", "dry_mass"))
+        engines.append(((total - load) * d, load * p, thrust * b * s, load / duration * b, duration * p / b))
+    payload = (20e3 if env_id == LEO else 4164) + 20 * z["payload"]
+    if env_id == LEO:
+        (d1, m1, T1, f1, t1), (d2, m2, T2, f2, t2) = engines
+        rows = [(0, t1, T1, f1, d1), (t1, t1 + t2, T2, f2, 0), (t1 + t2, math.inf, 0, 0, 0)]
+        mass = payload + d1 + m1 + d2 + m2
+    else:
+        (d1, m1, T1, f1, t1), (d2, m2, T2, f2, t2), (d3, m3, T3, f3, t3) = engines
+        rows = [(0, t1, 6 * T1 + T2, 6 * f1 + f2, 6 * d1), (t1, 2 * t1, 3 * T1 + T2, 3 * f1 + f2, 3 * d1)]
+        rows += [(2 * t1, t2, T2, f2, d2), (t2, t2 + t3, T3, f3, 0), (t2 + t3, math.inf, 0, 0, 0)]
+        mass = payload + 9 * (d1 + m1) + d2 + m2 + d3 + m3
+    return mass, rows, factor("drag"), (20 * z["wind_east"], 20 * z["wind_north"])
+
+
+def derivative(t, s, u, thrust, flow, drag, wind, area):
+    x, y, z, vx, vy, vz, m = s
+    r, longitude = math.sqrt(x * x + y * y + z * z), math.atan2(y, x)
+    latitude = math.asin(z / r)
+    east = np.array([-math.sin(longitude), math.cos(longitude), 0.0])
+    north = np.array([-math.sin(latitude) * math.cos(longitude), -math.sin(latitude) * math.sin(longitude), 0.0])
+    north[2] = math.cos(latitude)
+    blows = math.exp(-(((r - RE - 12000) / 5000) ** 2)) * (wind[0] * east + wind[1] * north)
+    w = np.array([vx + OMEGA * y, vy - OMEGA * x, vz]) - blows
+    pull = -0.5 * 1.225 * math.exp(-(r - RE) / 7200) * 0.5 * area * drag * np.linalg.norm(w) * w
+    return [vx, vy, vz, *(-MU / r**3 * np.array([x, y, z]) + (thrust * np.array(u) + pull) / m), -flow]
+
+
+def energy(s):
+    return (s[3] ** 2 + s[4] ** 2 + s[5] ** 2) / 2 - MU / math.sqrt(s[0] ** 2 + s[1] ** 2 + s[2] ** 2)
+
+
+def integrate(env_id, z, s, begin, end, u, goal=None):
+    """State at `end`, by DOP853 between the drawn events; with a goal (time, state) where the energy reaches it."""
+    _, rows, *air = typed(env_id, z)
+    reached = [lambda t, s, *_: (energy(s) - goal) / 1e6] if goal else None
+    for start, stop, thrust, flow, dropped in rows:
+        a, b = max(begin, start), min(end, stop)
+        if a < b:
+            args = (u, thrust, flow, *air, 10.5 if env_id == LEO else 4 * math.pi)
+            tolerances = {"rtol": 1e-11, "atol": [1e-5] * 3 + [1e-8] * 4, "first_step": b - a}
+            solution = solve_ivp(derivative, (a, b), s, "DOP853", args=args, events=reached, **tolerances)
+            if goal and len(solution.t_events[0]):
+                return solution.t_events[0][0], solution.y_events[0][0]
+            s = solution.y[:, -1].copy()
+            s[6] -= dropped if stop <= end else 0
+    return s
+
+
+def direction(env_id, t):
+    """A sensible ascent by (up, along, across) at time t, with some yaw to and fro."""
+    times = [0, 10, 40, 75, 150, 261, 400, 600, 800, 961]
+    pitches = [90, 88, 72, 42, 24, 11, 8, 1, 0, 5]
+    if env_id == LEO:
+        times, pitches = [0, 15, 60, 100, 162, 300, 450, 555], [90, 88, 60, 45, 30, 15, 4, -3]
+    pitch, yaw = math.radians(np.interp(t, times, pitches)), math.radians(3) * math.sin(t / 80)
+    return np.array([math.sin(pitch), math.cos(pitch) * math.cos(yaw), math.cos(pitch) * math.sin(yaw)])
+
+
+def vector(env_id, z):
+    return np.array([z[name] for name in (LEO_DRAW if env_id == LEO else DRAW)])
+
+
+@cache
+def flown(env_id, **options):
+    """The sensible ascent with the draw of `scores`."""
+    pilot = lambda obs, k: direction(env_id, 2.0 * k)[None]  # noqa: E731
+    draw = vector(env_id, scores(env_id))
+    return fly_rocket(env_id, pilot, draw=draw, dispersion=1, action_frame="local", **options)
+
+
+def make(env_id, num_envs=1, dispersion=1.0, **options):
+    return gym.make_vec(env_id, num_envs=num_envs, dispersion=dispersion, action_frame="local", **options)
+
+
+def episode(batch, env_id, options=None):
+    """One episode of each environment: observations, rewards and the final info of each, by lists over steps."""
+    obs, _ = batch.reset(seed=5, options=options)
+    seen, rewards, final = [obs], [], {}
+    while len(final) < batch.num_envs:
+        action = np.tile(direction(env_id, 2.0 * len(rewards)), (batch.num_envs, 1))
+        obs, reward, ended, _, info = batch.step(action)
+        shown = obs.copy()
+        for k in np.flatnonzero(ended):
+            shown[k] = info["final_obs"][k]
+            final.setdefault(k, {key: value[k] for key, value in info["final_info"].items() if key[0] != "_"})
+        seen.append(shown)
+        rewards.append(reward)
+    return np.array(seen), np.array(rewards), final
+
+
+# --- the flight -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_a_dispersed_flight_agrees_with_scipy(env_id):
+    flight, z = flown(env_id), scores(env_id)
+    mass, rows, *_ = typed(env_id, z)
+    assert flight["y"][0, 6] == pytest.approx(mass, rel=1e-14) and abs(mass - ROCKETS[env_id].rocket.x0[6]) > 50
+    y, t, goal = flight["y"][0], flight["t"], -MU / (2 * ROCKETS[env_id].rocket.a)
+    assert not flight["crashed"] and (flight["max_altitude_km"] > 120)
+    for k, u in enumerate(flight["u"]):
+        last = k == len(flight["u"]) - 1
+        if last and env_id != FIXED:
+            cut, y = integrate(env_id, z, y, t[k], 2.0 * k + 2, u, goal)
+            assert cut == pytest.approx(flight["final_time_s"], rel=1e-6)
+        else:
+            y = integrate(env_id, z, y, t[k], t[k + 1], u)
+        for part in (slice(0, 3), slice(3, 6), slice(6, 7)):
+            miss = np.linalg.norm(flight["y"][k + 1, part] - y[part])
+            assert miss < 1e-6 * np.linalg.norm(y[part]), (k, part)
+    if env_id == FIXED:
+        assert rows[-2][1] < 961 - 4 == flight["final_time_s"] - 4, "it should have run dry and coasted"
+        assert flight["y"][-1, 6] == flight["y"][-2, 6]
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_what_is_loaded_is_burnt_or_dropped(env_id):
+    z = scores(env_id)
+    z |= {"burn_rate_3" if env_id != LEO else "burn_rate_2": 2.0}
+    mass, rows, *_ = typed(env_id, z)
+    vehicles = envs.draw_vehicles(ROCKETS[env_id].rocket, 1.0, vector(env_id, z)[None])
+    assert vehicles.mass[0] == pytest.approx(mass, rel=1e-14)
+    np.testing.assert_allclose(vehicles.end[:-1, 0], [row[1] for row in rows[:-1]], rtol=1e-14)
+    np.testing.assert_allclose(vehicles.thrust[:, 0], [row[2] for row in rows], rtol=1e-14)
+    burnt = sum(flow * (end - start) for start, end, _, flow, _ in rows if flow)
+    left = mass - burnt - sum(row[4] for row in rows)
+    assert left == pytest.approx(vehicles.dry_mass[0], abs=1e-6)
+    assert vehicles.dropped.sum() == pytest.approx(sum(row[4] for row in rows), abs=1e-6)
+
+
+def test_an_engine_that_uses_a_part_uses_the_same_part_and_the_rest_is_dropped():
+    half = replace(envs.STAGE_1, propellant=2 * 95550.0, total_mass=104380.0 + 95550, burn_time=522.0)
+    burns = [replace(burn, engines=(*burn.engines[:-1], (1, half))) for burn in ROCKET.burns[:3]]
+    burns[2] = replace(burns[2], dropped=((1, half),))
+    rocket = replace(ROCKET, burns=(*burns, ROCKET.burns[3]))
+    z = scores(CUTOFF)
+    vehicles = envs.draw_vehicles(rocket, 1.0, vector(CUTOFF, z)[None])
+    load, rate = 1 + 0.003 * z["propellant_2"], 1 + 0.005 * z["burn_rate_2"]
+    assert vehicles.end[2, 0] == pytest.approx(261 * load / rate, rel=1e-14)
+    left = 2 * 95550 * load - 2 * 95550 / 522 * rate * vehicles.end[2, 0]
+    assert left == pytest.approx(95550 * load, rel=1e-12)
+    assert vehicles.dropped[2, 0] == pytest.approx((104380 - 95550) * (1 + 0.005 * z["dry_mass_2"]) + left, rel=1e-12)
+
+
+def test_the_first_to_run_out_ends_a_burn_and_none_burns_what_it_has_not():
+    a = envs.Engine(20e3, 18e3, 1.5e6, 280.0, 100.0)
+    b = envs.Engine(30e3, 28e3, 1.5e6, 280.0, 100.0)
+    top = envs.Engine(9e3, 8e3, 2e5, 300.0, 100.0)
+    both = envs.Burn(100.0, ((1, a), (1, b)), dropped=((1, a), (1, b)))
+    rocket = replace(ROCKET, burns=(both, envs.Burn(200.0, ((1, top),))), end_time=200.0)
+    names = envs.draw_names(rocket)
+    assert names[:3] == ("burn_rate_1", "burn_rate_2", "burn_rate_3") and len(names) == 16
+    z = np.zeros((1, 16))
+    z[0, [0, 1]] = 2.0, -2.0
+    vehicles = envs.draw_vehicles(rocket, 1.0, z)
+    end = 100 / 1.01
+    assert vehicles.end[0, 0] == pytest.approx(end, rel=1e-14)
+    assert vehicles.dropped[0, 0] == pytest.approx(2e3 + 2e3 + 28e3 - 280 * 0.99 * end, rel=1e-12)
+    # a core that would outlive its boosters nominally ends their burn where it runs out before them
+    b = replace(b, burn_time=101.0)
+    core = envs.Burn(101.0, ((1, b),), dropped=((1, b),))
+    boosted = envs.Burn(100.0, ((1, a), (1, b)), dropped=((1, a),))
+    rocket = replace(ROCKET, burns=(boosted, core, envs.Burn(201.0, ((1, top),))), end_time=201.0)
+    z[0, [0, 1]] = -2.0, 3.0
+    vehicles = envs.draw_vehicles(rocket, 1.0, z)
+    assert vehicles.end[0, 0] == vehicles.end[1, 0] == pytest.approx(101 / 1.015, rel=1e-14)
+    burnt = vehicles.flow[0, 0] * vehicles.end[0, 0]
+    dropped = vehicles.dropped[:, 0].sum()
+    assert vehicles.mass[0] - burnt - dropped == pytest.approx(ROCKET.payload + 9e3, abs=1e-6)
+
+
+@pytest.mark.parametrize("step", [0, 3, 17])
+def test_two_events_in_one_step_are_both_flown(step):
+    """Two stages that leave 0.6 s apart, both within a step, flown once more by hand."""
+    first = envs.Engine(2000.0, 1500.0, 4e6, 280.0, 2.0 * step + 0.7)
+    second = envs.Engine(1000.0, 900.0, 3e6, 280.0, 0.6)
+    burns = [envs.Burn(2.0 * step + 0.7, ((1, first),), ((1, first),)), envs.Burn(2.0 * step + 1.3, ((1, second),),
+             ((1, second),)), envs.Burn(2.0 * step + 101.0, ((1, envs.STAGE_2),))]  # fmt: skip
+    rocket = replace(ROCKET, burns=tuple(burns), end_time=burns[-1].end)
+    for dispersion in (0, 1):
+        options = {} if dispersion == 0 else {"options": {"draw": np.zeros((1, 16))}}
+        batch = make(FIXED, dispersion=dispersion, rocket=rocket, observe_mass=True)
+        batch.reset(**options)
+        for _ in range(step + 1):
+            obs = batch.step([[1.0, 0.0, 0.0]])[0]
+        mass = rocket.payload + 19300 - 0.7 * 16820 / 700
+        assert obs[0, 6] == pytest.approx(mass, abs=1e-6)
+        assert obs[0, 8] == 1.0
+
+
+def test_events_and_ends_are_each_flights_own():
+    z = [scores(CUTOFF) | {"propellant_3": p, "burn_rate_3": -p} for p in (-2.0, 0.0, 2.5)]
+    rows = [typed(CUTOFF, one)[1] for one in z]
+    batch = make(CUTOFF, 3, observe_mass=True)
+    obs, _ = batch.reset(options={"draw": [vector(CUTOFF, one) for one in z]})
+    final, m = {}, [obs[:, 6]]
+    while len(final) < 3:  # tangential from the pad to far above: never at the target's energy in time
+        obs, _, ended, _, info = batch.step(np.tile([1.0, 0.05, 0.4 if len(m) % 2 else -0.4], (3, 1)))
+        m.append(obs[:, 6])
+        for k in np.flatnonzero(ended & [k not in final for k in range(3)]):
+            final[k] = info["final_info"]["final_time_s"][k], info["final_info"]["final_mass_kg"][k]
+            final[k] += (info["final_info"]["crashed"][k], info["final_obs"][k, 7])
+    for k in range(3):
+        dry = 4164 + 20 * z[k]["payload"] + 2480 * (1 + 0.005 * z[k]["dry_mass_3"])
+        assert final[k][0] == pytest.approx(rows[k][3][1], rel=1e-14)
+        assert final[k][1] == pytest.approx(dry, abs=1e-6) and not final[k][2]
+        assert final[k][3] == pytest.approx(1 - rows[k][3][1] / 961, abs=1e-14)
+    assert final[2][0] > 970 and final[2][3] < 0
+    assert batch.single_observation_space.low[7] < final[2][3]
+    assert batch.episode_steps * 2 >= final[2][0] and len(m) - 1 == math.ceil(final[2][0] / 2)
+    # the first booster staging within its step: the flow before and after, and the drop
+    for k in range(3):
+        (_, event, _, before, dropped), (_, _, _, after, _) = rows[k][:2]
+        i = int(event // 2)
+        expected = m[i][k] - before * (event - 2 * i) - dropped - after * (2 * i + 2 - event)
+        assert m[i + 1][k] == pytest.approx(expected, abs=1e-6)
+
+
+def test_another_end_time_rules_everybody():
+    batch = make(CUTOFF, 4)
+    batch.end_time = 300.5
+    assert batch.episode_steps == 151 and batch.end_time == 300.5
+    final = episode(batch, CUTOFF)[2]
+    assert {f["final_time_s"] for f in final.values()} == {300.5}
+    batch.end_time = 961.0
+    assert batch.episode_steps > 481
+
+
+def test_the_observed_mass_is_the_flight_computers():
+    z = scores(FIXED)
+    rows = typed(FIXED, z)[1]
+    seen = np.array([obs[0] for obs in episode(make(FIXED), FIXED, {"draw": [vector(FIXED, z)]})[0]])
+    # the nominal vehicle: masses at the beginning of its burns, and its flows
+    masses = [301454, 301454 - 75.2 * (6 * 17010 / 75.2 + 95550 / 261) - 6 * 2280]
+    masses.append(masses[1] - 75.2 * (3 * 17010 / 75.2 + 95550 / 261) - 3 * 2280)
+    masses.append(4164 + 19300)
+    flows = [6 * 17010 / 75.2 + 95550 / 261, 3 * 17010 / 75.2 + 95550 / 261, 95550 / 261, 16820 / 700]
+    for k, t in enumerate(np.append(np.arange(0, 961, 2.0), 961)):
+        burn = sum(row[1] <= t for row in rows[:3])
+        mass = max(masses[burn] - flows[burn] * (t - rows[burn][0]), 4164 + 2480)
+        assert seen[k, 6] == pytest.approx(mass, abs=1e-6), t
+        if t < 961:
+            assert seen[k, 8] == burn / 3
+    true = flown(FIXED)["y"][:, 6]
+    assert np.abs(seen[:, 6] - true).min() > 0 and np.abs(seen[:, 6] - true).max() > 300
+    shown = episode(make(FIXED, observe_mass=True), FIXED, {"draw": [vector(FIXED, z)]})[0][:, 0]
+    np.testing.assert_array_equal(shown[:, 6], true)
+    np.testing.assert_array_equal(np.delete(shown, 6, axis=1), np.delete(seen, 6, axis=1))
+
+
+def test_the_flight_computer_never_shows_less_than_the_nominal_dry_mass():
+    z = np.zeros((1, len(DRAW)))
+    z[0, [DRAW.index("propellant_3"), DRAW.index("burn_rate_3")]] = 3.0, -3.0
+    seen = episode(make(CUTOFF), CUTOFF, {"draw": z})[0]
+    late = np.concatenate([episode(make(CUTOFF, table_isp=True), CUTOFF, {"draw": z})[0][:, 0, 6], seen[:, 0, 6]])
+    assert late.min() >= 6644
+
+
+# --- dispersion 0 and 1 -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_without_dispersion_nothing_changes(env_id):
+    plain = gym.make_vec(env_id, num_envs=3, action_frame="local")
+    for options in ({"dispersion": 0}, {"dispersion": 0.0, "observe_mass": True}):
+        other = gym.make_vec(env_id, num_envs=3, action_frame="local", **options)
+        (obs, rewards, final), (*others, other_final) = episode(plain, env_id), episode(other, env_id)
+        np.testing.assert_array_equal(obs, others[0])
+        np.testing.assert_array_equal(rewards, others[1])
+        assert "draw" not in final[0] and final.keys() == other_final.keys()
+        for k in final:
+            for key, value in final[k].items():
+                np.testing.assert_array_equal(value, other_final[k][key])
+    assert plain.single_observation_space == other.single_observation_space
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_a_draw_of_zeros_is_the_nominal_flight(env_id):
+    nominal = episode(gym.make_vec(env_id, num_envs=1, action_frame="local"), env_id)
+    drawn = episode(make(env_id), env_id, {"draw": np.zeros((1, len(vector(env_id, scores(env_id)))))})
+    np.testing.assert_allclose(drawn[0], nominal[0], rtol=1e-9, atol=1e-6)
+    np.testing.assert_allclose(drawn[1], nominal[1], rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize("dispersion", [1, 2.0])
+def test_dispersion_scales_the_scores(dispersion):
+    z = vector(CUTOFF, scores(CUTOFF))[None]
+    once, scaled = envs.draw_vehicles(ROCKET, 1, dispersion * z), envs.draw_vehicles(ROCKET, dispersion, z)
+    for a, b in zip(once, scaled):
+        np.testing.assert_allclose(a, b, rtol=1e-13)
+
+
+# --- draws ------------------------------------------------------------------------------------------------------------
+
+
+def test_names_of_the_scores():
+    kinds = ("burn_rate", "isp", "propellant", "dry_mass")
+    expected = [f"{kind}_{j}" for kind in kinds for j in (1, 2, 3)] + ["payload", "drag", "wind_east", "wind_north"]
+    assert list(DRAW) == expected and list(envs.draw_names(ROCKETS[LEO].rocket)) == LEO_DRAW
+    assert envs.Dispersion() == envs.DISPERSION and vars(envs.DISPERSION) == SIGMAS | {"payload": 20.0, "wind": 20.0}
+    with pytest.raises(AttributeError):
+        envs.DISPERSION.wind = 1.0
+
+
+def test_statistics_of_the_draws():
+    batch = make(CUTOFF, 20000)
+    batch.reset(seed=3)
+    z = batch.draw
+    n = z.shape[0]
+    assert z.shape == (n, 16) and np.abs(z).max() == 3.0
+    assert np.abs(z.mean(axis=0)).max() < 5 / math.sqrt(n)
+    np.testing.assert_allclose(z.std(axis=0), 1.0, atol=5 / math.sqrt(2 * n) + 0.007)  # clipping takes 0.5 %
+    assert np.abs(np.corrcoef(z.T) - np.eye(16)).max() < 5 / math.sqrt(n)
+    beyond = 2 * 0.00135
+    assert np.mean(np.abs(z) == 3.0) == pytest.approx(beyond, abs=5 * math.sqrt(beyond / z.size))
+    assert batch.vehicles.mass.std() == pytest.approx(math.sqrt(
+        (0.003**2 * ((9 * 17010) ** 2 + 95550**2 + 16820**2)) + 20**2
+        + 0.005**2 * ((9 * 2280) ** 2 + 8830**2 + 2480**2)), rel=0.03)  # fmt: skip
+
+
+def test_seeds():
+    draws = []
+    for seed in (1, 1, 2):
+        batch = make(CUTOFF, 3)
+        batch.reset(seed=seed)
+        draws.append(batch.draw.copy())
+        batch.reset()
+        assert (batch.draw != draws[-1]).all()
+    np.testing.assert_array_equal(draws[0], draws[1])
+    assert (draws[0] != draws[2]).all() and len(np.unique(draws[0])) == draws[0].size
+
+
+def test_autoreset_draws_anew_only_for_those_that_ended():
+    batch = make(CUTOFF, 3)
+    batch.reset(seed=1)
+    before, mass = batch.draw.copy(), batch.vehicles.mass.copy()
+    action = np.array([[1.0, 0.1, 0], [-1.0, 0.0, 0.0], [1.0, 0.0, 0.1]])  # the second into the ground
+    ended = np.zeros(3, dtype=bool)
+    while not ended.any():
+        obs, _, ended, _, info = batch.step(action)
+    assert ended.tolist() == [False, True, False] and info["final_info"]["crashed"][1]
+    np.testing.assert_array_equal(info["final_info"]["draw"], before)
+    np.testing.assert_array_equal(batch.draw[[0, 2]], before[[0, 2]])
+    np.testing.assert_array_equal(batch.vehicles.mass[[0, 2]], mass[[0, 2]])
+    assert (batch.draw[1] != before[1]).all() and batch.vehicles.mass[1] != mass[1]
+    assert batch.y[6, 1] == batch.vehicles.mass[1] == envs.draw_vehicles(ROCKET, 1, batch.draw[1:2]).mass[0]
+    assert obs[1, 6] == 301454
+
+
+@pytest.mark.parametrize("env_id", [CUTOFF, LEO])
+def test_given_draws_reproduce_a_flight_alone_and_in_a_batch(env_id):
+    batch = make(env_id, 4, observe_draw=True)
+    obs, rewards, final = episode(batch, env_id)
+    assert len({f["final_time_s"] for f in final.values()}) == 4, "flights should differ"
+    again = episode(make(env_id, 4, observe_draw=True), env_id, {"draw": [final[k]["draw"] for k in range(4)]})
+    alone = gym.make(env_id, disable_env_checker=True, dispersion=1, action_frame="local", observe_draw=True)
+    for k in range(4):
+        seen, paid, ended = [alone.reset(options={"draw": final[k]["draw"]})[0]], [], False
+        while not ended:
+            row, reward, ended, _, info = alone.step(direction(env_id, 2.0 * len(paid)))
+            seen.append(row)
+            paid.append(reward)
+        n = len(paid)
+        for got in (obs, again[0]):
+            np.testing.assert_array_equal(got[: n + 1, k], seen)
+        for got in (rewards, again[1]):
+            np.testing.assert_allclose(got[:n, k], paid, rtol=0, atol=1e-12)
+        for key, value in final[k].items():
+            np.testing.assert_allclose(value, info[key], rtol=1e-12, atol=1e-11)
+            np.testing.assert_array_equal(value, again[2][k][key])
+
+
+def test_the_oracle_sees_the_draw_behind_the_nine():
+    batch, plain = make(CUTOFF, 3, observe_draw=True), make(CUTOFF, 3)
+    obs, nine = batch.reset(seed=2)[0], plain.reset(seed=2)[0]
+    assert obs.shape == (3, 25) and batch.single_observation_space.shape == (25,)
+    np.testing.assert_array_equal(obs[:, 9:], batch.draw)
+    np.testing.assert_array_equal(obs[:, :9], nine)
+    obs = batch.step(np.eye(3)[[0, 0, 0]])[0]
+    np.testing.assert_array_equal(obs[:, 9:], batch.draw)
+    assert (obs[0, 9:] != obs[1, 9:]).all() and obs in batch.observation_space
+    assert make(LEO, observe_draw=True).reset()[0].shape == (1, 21)
+
+
+# --- wind and drag ----------------------------------------------------------------------------------------------------
+
+
+def acceleration(altitude, latitude=0.0, **air):
+    """Up, east and north of what `ascent` adds to gravity at rest over the ground, without thrust."""
+    c, s, r = math.cos(latitude), math.sin(latitude), RE + altitude
+    state = (r * c, 0.0, r * s, 0.0, OMEGA * r * c, 0.0, 1e3)
+    a = np.array(ascent(state, (1.0, 0, 0, 0.0, 0.0), **air)[3:6]) + MU / r**2 * np.array([c, 0, s])
+    return a @ np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]).T
+
+
+@pytest.mark.parametrize("latitude", [0.0, 0.5, -1.2])
+def test_wind_pushes_where_it_blows(latitude):
+    q = 0.5 * 1.225 * math.exp(-12000 / 7200) * 0.5 * 4 * math.pi / 1e3
+    np.testing.assert_allclose(acceleration(12e3, latitude), 0, atol=1e-12)
+    east = acceleration(12e3, latitude, wind=(30.0, 0.0))
+    np.testing.assert_allclose(east, [0, q * 30**2, 0], atol=1e-9)
+    north = acceleration(12e3, latitude, wind=(0.0, 30.0))
+    np.testing.assert_allclose(north, [0, 0, q * 30**2], atol=1e-9)
+    thin = acceleration(17e3, latitude, wind=(0.0, -30.0))
+    blows = 30 * math.exp(-1)
+    q = 0.5 * 1.225 * math.exp(-17000 / 7200) * 0.5 * 4 * math.pi / 1e3
+    np.testing.assert_allclose(thin, [0, 0, -q * blows**2], atol=1e-9)
+    np.testing.assert_allclose(acceleration(12e3, latitude, wind=(30.0, 0.0), drag_factor=1.3), 1.3 * east, atol=1e-9)
+
+
+def test_wind_and_drag_of_a_flight():
+    """Straight up: the wind shifts the flight to where it blows, drag takes speed."""
+    z = np.zeros((5, 16))
+    z[[1, 2, 3, 4], [DRAW.index(name) for name in ("wind_east", "wind_north", "drag", "drag")]] = 2, 2, 2, -2
+    batch = make(CUTOFF, 5)
+    batch.reset(options={"draw": z})
+    for _ in range(35):
+        obs = batch.step(np.tile([1.0, 0.0, 0.0], (5, 1)))[0]
+    shift = obs[:, :3] - obs[0, :3]
+    assert shift[1, 1] > 10 and shift[2, 2] > 10 and abs(shift[2, 1]) < 0.1 * shift[2, 2]
+    speed = np.linalg.norm(obs[:, 3:6], axis=1)
+    assert speed[3] < speed[0] - 1 and speed[4] > speed[0] + 1
+
+
+def test_ascent_takes_casadi_symbols_with_wind():
+    casadi = pytest.importorskip("casadi")
+    x, wind, factor = casadi.SX.sym("x", 7), casadi.SX.sym("w", 2), casadi.SX.sym("f")
+    u = (0.6, 0.0, 0.8, 1e6, 300.0)
+    f = casadi.Function("f", [x, wind, factor], [casadi.vertcat(*ascent(
+        casadi.vertsplit(x), u, ROCKET, casadi.vertsplit(wind), factor))])  # fmt: skip
+    state = ROCKET.x0 + [500.0, 200.0, 9000.0, 30.0, 20.0, -40.0, -5000.0]
+    got = np.array(f(state, [30.0, -20.0], 1.2))[:, 0]
+    np.testing.assert_allclose(got, ascent(tuple(state), u, ROCKET, (30.0, -20.0), 1.2), rtol=1e-13)
+
+
+# --- refusals and extremes --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("value", [-0.1, math.nan, math.inf, 101, "1", None])
+def test_bad_dispersions_are_refused(value):
+    for create in (gym.make_vec, gym.make):
+        with pytest.raises(BadInput, match=r"^dispersion is .* must be a number from 0 to 100$"):
+            create(CUTOFF, dispersion=value)
+
+
+def changed(name, value):
+    z = np.zeros(16)
+    z[DRAW.index(name)] = value
+    return z
+
+
+@pytest.mark.parametrize(
+    "draw, message",
+    [
+        (np.zeros(15), r"of shape \(1, 15\)"),
+        (0.0, r"of shape \(1,\)"),
+        ("no", r"options\['draw'\] is of shape"),
+        ([[1.0], [2.0, 3.0]], r"options\['draw'\] is of shape"),
+        (changed("isp_2", math.nan), "is nan; it must hold finite numbers"),
+        (changed("drag", -math.inf), "is -inf; it must hold finite numbers"),
+        (changed("burn_rate_1", -200.0), "burn_rate_1 of draw 0 is -200.0; it must be larger"),
+        (changed("propellant_3", -400.0), "propellant_3 of draw 0 is -400.0; it must be larger"),
+        (changed("dry_mass_2", -201.0), "dry_mass_2 of draw 0"),
+        (changed("payload", -209.0), "payload of draw 0"),
+        (changed("drag", -7.2), "drag of draw 0"),
+    ],
+)
+def test_bad_draws_are_refused(draw, message):
+    batch, alone = make(CUTOFF), gym.make(CUTOFF, dispersion=1)
+    batch.reset(seed=0)
+    before = batch.draw.copy()
+    for reset, given in ((batch.reset, [draw]), (alone.reset, draw)):
+        with pytest.raises(BadInput, match=message) as caught:
+            reset(options={"draw": given})
+        assert "\n" not in str(caught.value)
+    np.testing.assert_array_equal(batch.draw, before)
+
+
+def test_bad_options_are_refused():
+    with pytest.raises(BadInput, match="'draw'.*no options but with dispersion"):
+        gym.make_vec(CUTOFF).reset(options={"draw": np.zeros((1, 16))})
+    with pytest.raises(BadInput, match="the only one is 'draw'"):
+        make(CUTOFF).reset(options={"x0": 1})
+    batch = make(CUTOFF)
+    batch.reset(options={"draw": changed("drag", -7.0)[None]})
+    batch.reset(options={"draw": changed("payload", -208.0)[None]})
+    assert batch.vehicles.dry_mass[0] == pytest.approx(4 + 2480)
+
+
+@pytest.mark.parametrize("dispersion", [5, 100])
+def test_wild_dispersions_crash_but_do_not_raise(dispersion):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        batch = make(CUTOFF, 64, dispersion=dispersion, observe_draw=True, observe_mass=True)
+        obs, rewards, final = episode(batch, CUTOFF)
+    assert np.isfinite(obs).all() and np.isfinite(rewards).all()
+    assert any(f["crashed"] for f in final.values())
+    inside = (obs >= batch.single_observation_space.low) & (obs <= batch.single_observation_space.high)
+    assert inside.all()
+    draws = np.array([f["draw"] for f in final.values()])
+    assert np.abs(dispersion * 0.14 * draws[:, DRAW.index("drag")]).max() == pytest.approx(0.9)
+    again = envs.draw_vehicles(ROCKET, dispersion, draws)  # what was drawn can be given again
+    assert again.drag.min() == pytest.approx(0.1) and again.mass.min() > 0
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_check_env(env_id):
+    env = gym.make(env_id, dispersion=1, observe_draw=env_id == FIXED)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", message=r".*A Box (observation|action) space")
+        check_env(env.unwrapped, skip_render_check=True)
+
+
+def test_table_isp_flies_dispersed_and_drops_what_is_left():
+    z = scores(FIXED)
+    final = episode(make(FIXED, table_isp=True), FIXED, {"draw": [vector(FIXED, z)]})[2][0]
+    dry = 4164 + 20 * z["payload"] + 2480 * (1 + 0.005 * z["dry_mass_3"])
+    assert final["final_time_s"] == 961 and final["final_mass_kg"] == pytest.approx(dry, abs=1e-6)
+
+
+def test_a_crash_is_charged_the_flights_own_propellant():
+    z = np.zeros((2, 16))
+    z[1, DRAW.index("propellant_3")] = 2.0
+    batch = make(CUTOFF, 2)
+    batch.mass_weight = 1.0
+    batch.reset(options={"draw": z})
+    final = batch.step(np.tile([-1.0, 0.0, 0.0], (2, 1)))[4]["final_info"]
+    assert final["crashed"].all()
+    difference = final["R_penalties"][1] - final["R_penalties"][0]
+    assert difference == pytest.approx(-16820 * 2 * 0.003 / 100, rel=1e-9)
+
+
+def test_dispersed_flights_are_drawn():
+    env = gym.make(CUTOFF, dispersion=1, render_mode="rgb_array")
+    env.reset(seed=0)
+    env.step(np.array([1.0, 0.0, 0.3]))
+    frame = env.render()
+    assert frame.ndim == 3 and frame.dtype == np.uint8 and frame.std() > 0
