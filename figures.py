@@ -12,12 +12,12 @@ import numpy as np
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Circle
+from matplotlib.patches import Circle, Rectangle
 from matplotlib.ticker import EngFormatter
 
 import envs
 from baselines import replacing
-from evaluate import NEAR_ORIGIN, SUCCESS, altitude_km, comparable, cost_parts
+from evaluate import BOX, NEAR_ORIGIN, SUCCESS, altitude_km, comparable, cost_parts, element_misses
 
 # ---------------------------------------------------------------------------------------------------------------------
 # What every problem shows: policy red, optimum blue, target green, as in the paper. Time is in s; x, u, J have no unit
@@ -40,6 +40,8 @@ def draw(folder, arrays: dict, metrics: dict, curve: dict | None = None, others=
     drawn = {} if curve is None else {"training.png": draw_training([curve, *others], metrics)}
     if metrics["env_id"] in envs.ROCKETS:
         drawn |= {"trajectory.png": draw_ascent(arrays, metrics), "orbit.png": draw_orbit(arrays, metrics)}
+        if "dispersion" in metrics:
+            drawn |= {"dispersed.png": draw_dispersed({"policy": arrays}, metrics)}
     else:
         drawn |= {"trajectories.png": draw_trajectories(arrays, metrics), "costs.png": draw_costs(arrays, metrics)}
         if len(envs.PROBLEMS[metrics["env_id"]].phases) == 1:  # with waypoints a missed circle would count as a gain
@@ -429,3 +431,43 @@ def draw_ground_track(ax, arrays: dict, rocket: envs.Rocket):
     ax.set(xlim=(west - 2, east + 2), ylim=(south - 2, north + 2), title="Ground track")
     ax.set(xlabel="longitude from the launch site (deg)", ylabel="geocentric latitude (deg)")
     ax.legend(loc="lower left")
+
+
+def draw_dispersed(laws: dict[str, dict], metrics: dict) -> Figure:
+    """Where dispersed flights end: perigee over its argument, inclination over the node, distribution of ||error||.
+
+    `laws`: label -> the `draw`, `final_y`, ... arrays of `evaluate.evaluate_dispersed`, one colour each. Flights beyond
+    the axes, four boxes wide, are counted in the third panel alone. An angle that the target does not have is left out.
+    """
+    rocket = envs.ROCKETS[metrics["env_id"]].rocket
+    figure = Figure(figsize=(15, 5), layout="constrained")
+    *scatters, distribution = figure.subplots(1, 3)
+    labels = {"perigee_km": "perigee (km)", "i_deg": "inclination (deg)"}
+    labels |= {"raan_deg": "right ascension of the node (deg)", "argp_deg": "argument of perigee (deg)"}
+    for ax, (x, y) in zip(scatters, (("argp_deg", "perigee_km"), ("raan_deg", "i_deg"))):
+        for label, arrays in laws.items():
+            misses = element_misses(final_elements(arrays["final_y"], rocket), rocket)
+            across = misses.get(x, np.zeros(len(arrays["final_y"])))
+            ax.plot(across, misses[y], ".", markersize=3, alpha=0.5, label=label)
+        ax.add_patch(Rectangle((-BOX[x], -BOX[y]), 2 * BOX[x], 2 * BOX[y], fill=False, **TARGET))
+        ax.set(xlabel=f"{labels[x]} off the target", ylabel=f"{labels[y]} off the target")
+        ax.set(xlim=(-4 * BOX[x], 4 * BOX[x]), ylim=(-4 * BOX[y], 4 * BOX[y]))
+    for label, arrays in laws.items():
+        errors = np.sort(np.linalg.norm(arrays["final_error"], axis=1))
+        distribution.step(errors, np.arange(1, len(errors) + 1) / len(errors), where="post", label=label)
+    distribution.set(xlabel="$\\Vert$error$\\Vert$", ylabel="share of the flights at most that far off", xscale="log")
+    for ax in figure.axes:
+        ax.grid(alpha=0.3)
+    handles, names = distribution.get_legend_handles_labels()
+    handles.append(Line2D([], [], **TARGET))
+    figure.legend(handles, [*names, "a launcher's accuracy"], loc="outside lower center", ncols=len(handles))
+    flights = f"{metrics['dispersed_starts']} flights at dispersion {metrics['dispersion']:g}"
+    figure.suptitle(f"{metrics['env_id']}: {flights}, {metrics['dispersed_box_rate']:.1%} inside the box")
+    return figure
+
+
+def final_elements(y: np.ndarray, rocket: envs.Rocket) -> dict:
+    """The elements of states (n, 7) in the names of `final_info`."""
+    elements = envs.orbital_elements(y, rocket.mu)
+    degrees = {f"{name}_deg": np.degrees(getattr(elements, name)) for name in ("i", "raan", "argp")}
+    return {"a_km": elements.a / 1e3, "e": elements.e, **degrees}

@@ -52,6 +52,9 @@ class Args:
     # environment
     env_id: str = "RocketAscent-v0"  # the id of the environment, one of ENV_IDS
     observe_phase: bool = True  # show time and phase to the policy
+    dispersion: float = 0.0  # every flight draws its own vehicle and air: 0 none, 1 the table `envs.Dispersion`
+    observe_draw: bool = False  # show the draw to the policy: an oracle
+    observe_mass: bool = False  # show the true mass of a dispersed rocket, not the flight computer's
     action_frame: str = "local"  # the thrust direction's axes: local (up, along-track, cross-track) or eci
     guidance: str = "none"  # early reference pitch of R_guidance: none (R_guidance is 0), linear or knots
     mass_weight: float = 1.0  # cut-off: reward lost for each 1.5 % of the dry mass (100 kg) burnt in the last phase
@@ -95,7 +98,7 @@ class Args:
 
 # Problem: what differs from the other scripts -------------------------------------------------------------------------
 ENV_IDS = tuple(ROCKETS)
-ENV_OPTIONS = ("observe_phase", "action_frame")  # arguments of the environments
+ENV_OPTIONS = ("observe_phase", "action_frame", "dispersion", "observe_draw", "observe_mass")  # of the environments
 
 
 def constants(rocket):
@@ -117,7 +120,7 @@ INITIAL_ACTION = [1.0, 0.0, 0.0]  # straight up: a randomly steered rocket never
 
 
 def features(agent, obs):
-    """What the encoder sees of observations (..., 9): the state in the target orbit's axes, and its error.
+    """What the encoder sees of observations (..., 9 or more): the state in the target orbit's axes, and its error.
 
     h = r x v, e = v x h - r / |r| (mu = 1), error = [(h - h_T) / |h_T|, e - e_T], given raw and as tanh(10 error), so
     that small ones are seen. Frame, scales and tanh are ours: the paper gives the state alone.
@@ -136,7 +139,8 @@ def features(agent, obs):
     speed = v.norm(dim=-1, keepdim=True)
     phases = ((phase - agent.phases).abs() < 1e-3).to(obs.dtype)  # one-hot
     state = [r, v, altitude, radial_velocity, *out_of_plane, speed, t_norm, mass.log(), phases]
-    return torch.cat([*state, error, (10 * error).tanh()], dim=-1)
+    draw = obs[..., 9:]  # with --observe-draw
+    return torch.cat([*state, error, (10 * error).tanh(), draw], dim=-1)
 
 
 def mean_action(output, action_scale):

@@ -48,11 +48,12 @@ RANGES = {  # lowest and highest value of every numeric flag; NaN and infinity a
     **dict.fromkeys(["reward_scale", "max_grad_norm", "target_kl"], (1e-9, 1e9)),
     **dict.fromkeys(["log_std", "log_std_refine", "log_std_final"], (-8.0, 0.5)),
     **{"eval_starts": (10, 10**6), "num_blocks": (1, 64), "memory_length": (0, 8192)},
-    **{"flights_per_start": (1, 10**6)},
+    **{"flights_per_start": (1, 10**6), "dispersion": (0.0, 10.0)},
 }
 CHOICES = {"action_frame": ("local", "eci"), "guidance": ("none", "linear", "knots")}
 CHOICES |= {"noise": ("learned", "schedule", "gated"), "lr_schedule": ("linear", "std")}
 NETWORK = ("num_blocks", "embed_dim", "num_heads", "memory_length", "mlp_dim", "hidden_dim")
+NOT_OF_A_CHECKPOINT = {"dispersion"}  # options of the environment that are chosen anew for every run and evaluation
 MAY_CHANGE_ON_RESUME = {"resume", "cuda", "num_threads"}
 
 
@@ -116,6 +117,8 @@ def parse_args(kind, argv, env_options, buffers):
         args.gae_lambda_final = args.gae_lambda
     if args.eval_starts is None:
         args.eval_starts = 1000 if args.eval_only else 50
+        if getattr(args, "dispersion", 0.0):
+            args.eval_starts = evaluate.DISPERSED_STARTS
     return args, saved
 
 
@@ -124,8 +127,10 @@ def read_checkpoint(args, kind, typed, env_options, buffers):
 
     Its environment may be another with the same buffers, and its noise is gone on with, unless a flag says otherwise.
     """
-    decided = {name: type(getattr(kind, name)) for name in ("env_id", *env_options, *NETWORK)}
-    saved = evaluate.read_checkpoint(args.checkpoint, decided, tuple(buffers))
+    options = [name for name in env_options if name not in NOT_OF_A_CHECKPOINT]
+    decided = {name: type(getattr(kind, name)) for name in ("env_id", *options, *NETWORK)}
+    defaults = {name: getattr(kind, name) for name in options}  # of options that are younger than the file
+    saved = evaluate.read_checkpoint(args.checkpoint, decided, tuple(buffers), defaults)
     for name in decided:
         value, given = saved["args"][name], getattr(args, name)
         if name == "env_id" and name in typed and value != given and buffers.get(value) == buffers.get(given):
@@ -277,6 +282,7 @@ def refuse_nan(values, epoch, minibatch):
 # ---------------------------------------------------------------------------------------------------------------------
 
 SAVE_EVERY = 10  # updates
+TRAINING_DISPERSED_STARTS = 100
 TRAINING_EVAL_SEED = 2**31  # beyond --eval-seed: no reported start is flown during training
 
 
@@ -395,7 +401,10 @@ class Run:
         """Fly the mean action of the averaged weights and the optimum: eval.json's metrics and eval.npz's arrays."""
         args, average = self.args, self.modules["average"].module
         policy = average.make_policy(self.envs.episode_steps)
-        metrics, arrays = evaluate.evaluate(args.env_id, policy, eval_seed, args.eval_starts, **self.env_options)
+        starts = args.eval_starts
+        if eval_seed == TRAINING_EVAL_SEED and getattr(args, "dispersion", 0.0):
+            starts = min(starts, TRAINING_DISPERSED_STARTS)
+        metrics, arrays = evaluate.evaluate(args.env_id, policy, eval_seed, starts, **self.env_options)
         device = average.actor_logstd.device.type
         return {**metrics, **self.progress, "device": device, "torch_version": torch.__version__}, arrays
 
