@@ -561,10 +561,13 @@ AT_ONCE = 341  # flights of a batch: a fifth, so that the caches of a policy sta
 BOX = {"perigee_km": 10.0, "apogee_km": 500.0, "i_deg": 0.1, "raan_deg": 0.1, "argp_deg": 0.3}
 
 
-def draws(env_id: str, eval_seed: int, n: int, rocket: envs.Rocket | None = None) -> np.ndarray:
-    """The n draws (n, k) of a seed, standard scores: the same for every law that is measured on them."""
-    k = len(envs.draw_names(rocket or envs.ROCKETS[env_id].rocket))
-    return np.random.default_rng([eval_seed, 2]).standard_normal((n, k)).clip(-3, 3)
+def draws(rocket: envs.Rocket, dispersion: float, eval_seed: int, n: int) -> np.ndarray:
+    """The n draws (n, k) of a seed, standard scores: the same for every law that is measured on them.
+
+    Clipped as the environment's own: at 3, earlier where a dispersion is so large that no such vehicle can be.
+    """
+    bounds = envs.draw_bounds(rocket, dispersion)
+    return np.random.default_rng([eval_seed, 2]).standard_normal((n, len(bounds))).clip(-bounds, bounds)
 
 
 def evaluate_dispersed(env_id: str, policy, eval_seed: int, n: int, dispersion: float, **env_options):
@@ -574,7 +577,7 @@ def evaluate_dispersed(env_id: str, policy, eval_seed: int, n: int, dispersion: 
     `final_t` (n,), `final_error` (n, 6). Flights that crash or run dry are counted, and are among the errors.
     """
     rocket = env_options.get("rocket") or envs.ROCKETS[env_id].rocket
-    z, parts = draws(env_id, eval_seed, n, rocket), []
+    z, parts = draws(rocket, dispersion, eval_seed, n), []
     for first in range(0, n, AT_ONCE):
         parts.append(fly_dispersed(env_id, policy, z[first : first + AT_ONCE], dispersion, **env_options))
     flights = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}

@@ -1,0 +1,186 @@
+"""The statistics of dispersed flights against plain formulas, the flags that ask for them, and the figure."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+import envs
+import evaluate
+import figures
+import runs
+
+CUTOFF, LEO = "RocketAscentCutoff-v0", "TwoStageLEO-v0"
+FLIGHTS = 12
+
+
+def optimum_replayed(env_id):
+    """A policy: the optimum's directions, open loop, the last one held."""
+    u = evaluate.optimum(env_id, 0, 1)["u"]
+    return lambda obs, t: np.repeat(u[None, min(t, len(u) - 1)], len(obs), axis=0)
+
+
+@pytest.fixture(scope="module", params=[CUTOFF, LEO])
+def flown(request):
+    env_id = request.param
+    return evaluate.evaluate(env_id, optimum_replayed(env_id), 7, FLIGHTS, dispersion=1)
+
+
+def misses(y, rocket):
+    """Perigee and apogee (km), i, RAAN, argument of perigee (degrees) off the target, by vectors and arc cosines."""
+    r, v = y[:3], y[3:6]
+    h, n = np.cross(r, v), np.cross([0, 0, 1], np.cross(r, v))
+    e = np.cross(v, h) / rocket.mu - r / np.linalg.norm(r)
+    p, ecc = h @ h / rocket.mu, np.linalg.norm(e)
+    raan = math.degrees(math.atan2(n[1], n[0]))
+    argp = math.degrees(math.acos(np.clip(n @ e / np.linalg.norm(n) / ecc, -1, 1)))
+    argp = argp if e[2] >= 0 else 360 - argp
+    i = math.degrees(math.acos(h[2] / np.linalg.norm(h)))
+    turn = lambda x: (x + 180) % 360 - 180  # noqa: E731
+    found = [
+        p / (1 + ecc) / 1e3 - rocket.a * (1 - rocket.e) / 1e3,
+        p / (1 - ecc) / 1e3 - rocket.a * (1 + rocket.e) / 1e3,
+    ]
+    return [*found, i - rocket.i, turn(raan - rocket.raan), turn(argp - rocket.argp)]
+
+
+def test_statistics_equal_plain_formulas(flown):
+    metrics, arrays = flown
+    rocket = envs.ROCKETS[metrics["env_id"]].rocket
+    errors = np.sort(np.sqrt((arrays["final_error"] ** 2).sum(1)))
+    assert len(errors) == metrics["dispersed_starts"] == FLIGHTS and metrics["dispersion"] == 1
+    assert metrics["dispersed_error_median"] == pytest.approx((errors[5] + errors[6]) / 2)
+    assert metrics["dispersed_error_max"] == pytest.approx(errors[-1])
+    assert metrics["dispersed_error_p95"] == pytest.approx(errors[10] + 0.45 * (errors[11] - errors[10]))
+    table = np.array([misses(y, rocket) for y in arrays["final_y"]])
+    keys = ["perigee_error_{}_km", "apogee_error_{}_km", "i_error_{}_deg", "raan_error_{}_deg", "argp_error_{}_deg"]
+    if rocket.e == 0:  # a circle has no perigee to measure its argument from
+        assert not any("argp" in key for key in metrics if key.startswith("dispersed"))
+        keys, table = keys[:4], table[:, :4]
+    for key, column in zip(keys, table.T):
+        assert metrics["dispersed_" + key.format("mean")] == pytest.approx(column.mean(), rel=1e-6, abs=1e-6)
+        deviation = math.sqrt(((column - column.mean()) ** 2).mean())
+        assert metrics["dispersed_" + key.format("std")] == pytest.approx(deviation, rel=1e-6, abs=1e-6)
+    box = np.array([10, 500, 0.1, 0.1, 0.3])[: len(keys)]
+    inside = int((np.abs(table) <= box).all(1).sum())
+    assert metrics["dispersed_box_rate"] == inside / FLIGHTS
+    mass = np.sort(arrays["final_y"][:, 6])
+    assert metrics["dispersed_mass_mean_kg"] == pytest.approx(mass.mean())
+    assert metrics["dispersed_mass_p01_kg"] == pytest.approx(mass[0] + 0.11 * (mass[1] - mass[0]))
+
+
+def test_draws_are_the_seeds_and_nobody_elses(flown):
+    metrics, arrays = flown
+    env_id = metrics["env_id"]
+    expected = np.random.default_rng([7, 2]).standard_normal(arrays["draw"].shape).clip(-3, 3)
+    np.testing.assert_array_equal(arrays["draw"], expected)
+    rocket = envs.ROCKETS[env_id].rocket
+    np.testing.assert_array_equal(evaluate.draws(rocket, 1.0, 7, 5), expected[:5])
+    assert not np.isin(evaluate.draws(rocket, 1.0, 8, 5), expected[np.abs(expected) < 3]).any()
+    assert arrays["final_y"].shape == (FLIGHTS, 7) and arrays["final_t"].shape == (FLIGHTS,)
+
+
+def test_one_flight_is_the_environments_own(flown):
+    """Flight 3 alone, with its draw, ends where it ended in the batch, its true mass among the state."""
+    metrics, arrays = flown
+    env_id = metrics["env_id"]
+    env, policy, done, t = envs.gym.make(env_id, dispersion=1).unwrapped, optimum_replayed(env_id), False, 0
+    obs, _ = env.reset(options={"draw": arrays["draw"][3]})
+    while not done:
+        obs, _, done, _, info = env.step(policy(obs[None], t)[0])
+        t += 1
+    np.testing.assert_array_equal(arrays["final_y"][3, :6], obs[:6])
+    assert arrays["final_y"][3, 6] == info["final_mass_kg"] and arrays["final_t"][3] == info["final_time_s"]
+    np.testing.assert_array_equal(arrays["final_error"][3], info["error"])
+
+
+def test_batches_change_nothing(flown, monkeypatch):
+    metrics, arrays = flown
+    env_id = metrics["env_id"]
+    monkeypatch.setattr(evaluate, "AT_ONCE", 5)
+    again, ends = evaluate.evaluate_dispersed(env_id, optimum_replayed(env_id), 7, FLIGHTS, 1)
+    assert all(np.array_equal(ends[key], arrays[key]) for key in ends)
+    assert all(metrics[key] == value for key, value in again.items())
+
+
+def test_the_nominal_flight_stays_what_it_is(flown):
+    metrics, arrays = flown
+    alone, nominal = evaluate.evaluate(metrics["env_id"], optimum_replayed(metrics["env_id"]), 7, FLIGHTS)
+    assert alone.keys() == {key for key in metrics if not key.startswith("dispers")}
+    assert all(metrics[key] == value for key, value in alone.items())
+    assert all(np.array_equal(arrays[key], value) for key, value in nominal.items())
+
+
+@pytest.mark.parametrize("inside, n", [(0, 20), (20, 20), (13, 20), (1705, 1705)])
+def test_wilson_interval(inside, n):
+    """(p + z^2 / 2n -+ z sqrt(p (1 - p) / n + z^2 / 4 n^2)) / (1 + z^2 / n), z = 1.959964."""
+    z, p = 1.959963984540054, inside / n
+    middle, half = p + z * z / (2 * n), z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
+    found = evaluate.box_rate(inside, n)
+    low, high = (middle - half) / (1 + z * z / n), (middle + half) / (1 + z * z / n)
+    assert found["dispersed_box_low"] == pytest.approx(low, abs=1e-12)
+    assert found["dispersed_box_high"] == pytest.approx(high, abs=1e-12)
+
+
+def test_crashes_are_counted_and_leave_no_gap():
+    """Five times the table: whoever falls is counted, the metrics stay finite."""
+    down = lambda obs, t: np.repeat([[-1.0, 0.2, 0.0]], len(obs), axis=0)  # noqa: E731
+    metrics, _ = evaluate.evaluate(CUTOFF, down, 0, 10, dispersion=5, action_frame="local")
+    assert metrics["dispersed_crashed"] == 10 and metrics["dispersed_box_rate"] == 0
+    assert not any("perigee_error" in key and "dispersed" in key for key in metrics)
+    assert all(math.isfinite(value) for value in metrics.values() if isinstance(value, float))
+    assert "10 crashed" in evaluate.table(metrics)
+
+
+def test_table_and_figure(flown, tmp_path):
+    metrics, arrays = flown
+    table = evaluate.table(metrics)
+    assert f"12 flights at dispersion 1: ||error|| median {metrics['dispersed_error_median']:.6f}" in table
+    figure = figures.draw_dispersed({"policy": arrays}, metrics)
+    (points,) = [line for line in figure.axes[0].lines if len(line.get_xdata()) == FLIGHTS]
+    mean = metrics["dispersed_perigee_error_mean_km"]
+    assert np.mean(points.get_ydata()) == pytest.approx(mean, rel=1e-9, abs=1e-9)
+    names = {path.name for path in figures.draw(tmp_path, arrays, metrics)}
+    assert names == {"trajectory.png", "orbit.png", "dispersed.png"}
+
+
+# --- flags ------------------------------------------------------------------------------------------------------------
+
+
+def script():
+    import ppo_gtrxl_rocket
+
+    return ppo_gtrxl_rocket
+
+
+def parse(*argv):
+    rocket = script()
+    return runs.parse_args(rocket.Args, list(argv), rocket.ENV_OPTIONS, rocket.BUFFERS)[0]
+
+
+def test_how_many_flights():
+    shipped = f"--checkpoint={runs.Path(__file__).parents[1]}/results/rocket_cutoff/agent.safetensors"
+    assert parse("--eval-only", shipped).eval_starts == 1000
+    assert parse("--eval-only", shipped, "--dispersion=1").eval_starts == 1705
+    assert parse("--dispersion=1").eval_starts == 1705 and parse("--dispersion=1", "--eval-starts=30").eval_starts == 30
+
+
+@pytest.mark.parametrize("value", ["-1", "nan", "11"])
+def test_a_dispersion_that_cannot_be_is_refused(value):
+    with pytest.raises(SystemExit, match=f"error: --dispersion {float(value)}: must be between 0.0 and 10.0"):
+        parse(f"--dispersion={value}")
+
+
+def test_a_file_older_than_the_flags_is_flown_and_an_oracle_needs_its_draw(tmp_path, monkeypatch):
+    """The shipped nominal policies know none of them; what sees a draw cannot be flown as if it did not."""
+    monkeypatch.chdir(tmp_path)
+    tiny = ["--embed-dim=8", "--num-heads=2", "--num-blocks=1", "--memory-length=4", "--mlp-dim=8", "--hidden-dim=8"]
+    script().main([*tiny, "--total-updates=1", "--num-envs=2", "--observe-draw", "--dispersion=1", "--eval-starts=10",
+                   "--env-id", LEO, "--eval-every=1"])  # fmt: skip
+    (run,) = (tmp_path / "runs").iterdir()
+    metrics = json.loads((run / "eval.json").read_text())
+    assert metrics["dispersed_starts"] == 10
+    with pytest.raises(SystemExit, match="--observe-draw False: the checkpoint has True; leave the flag out"):
+        parse("--eval-only", f"--checkpoint={run}/agent.safetensors", "--no-observe-draw")
+    assert parse("--eval-only", f"--checkpoint={run}/agent.safetensors").observe_draw
