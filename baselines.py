@@ -638,7 +638,9 @@ def optimise_ascent(case: Ascent, segments: int = SEGMENTS) -> dict:
             failure = error
     launch_raan = envs.launch_raan(rocket.latitude, rocket.i)
     plane = f"the launch site's plane at t = 0 has -arcsin(tan latitude / tan i) = {launch_raan:.4f}"
-    look = f"look at its raan, {rocket.raan} ({plane}), its payload, {rocket.payload} kg, and its i, {rocket.i}"
+    look = f"look at its raan, {rocket.raan:.8g} degrees ({plane}), its payload, {rocket.payload} kg, its i, {rocket.i}"
+    look += f", and its end_time, {rocket.end_time} s"
+    look += f", below {case.ceiling / 1e3:g} km" if np.isfinite(case.ceiling) else ""
     raise NoOptimum(f"{failure}, from every guess: the rocket may not reach its orbit; {look}")
 
 

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import importlib
 import sys
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -948,13 +949,15 @@ for _env_id in PROBLEMS:
 def register_rocket(env_id: str, rocket: Rocket, cutoff: bool = False, ceiling_km: float | None = None, **rules):
     """Make a rocket an environment id that references, evaluation, figures and `ppo_gtrxl_rocket.py` take, too.
 
-    `cutoff`, `ceiling_km` and `rules` are the fields of `Mission`. An id that is registered already is replaced. Raises
-    BadInput where the id is another environment's or cannot be one of Gymnasium's.
+    `cutoff`, `ceiling_km` and `rules` are the fields of `Mission`. An id that is registered already is replaced, with a
+    warning if it was another rocket's. Raises BadInput where the id is another environment's or not one of Gymnasium's.
     """
     others = gym.registry.keys() - ROCKETS.keys()
     if env_id in others or not gym.envs.registration.ENV_ID_RE.fullmatch(env_id) or "/" in env_id:
         raise BadInput(f"env_id is {env_id!r}; it must be a new id such as MyRocket-v0")
     mission = Mission(rocket, cutoff, ceiling_km, **rules)
+    if ROCKETS.get(env_id, mission) != mission:
+        warnings.warn(f"{env_id} was another rocket's id; from here on it is this one's", stacklevel=2)
     gym.registry.pop(env_id, None)
     try:
         gym.register(
@@ -975,6 +978,9 @@ def import_vehicles():
             importlib.import_module(f"vehicles.{path.stem}")
         except BadInput as error:
             print(f"vehicles/{path.name} is left out: {error}", file=sys.stderr)
+        except Exception as error:  # whatever is wrong with one file must not stop the others
+            why = f"{type(error).__name__}: {error}"
+            print(f"vehicles/{path.name} is left out: {why}", file=sys.stderr)
 
 
 for _env_id, _cutoff in {"RocketAscent-v0": False, "RocketAscentCutoff-v0": True}.items():

@@ -74,6 +74,14 @@ class Burn:
     engines: tuple[tuple[int, Engine], ...]
     dropped: tuple[tuple[int, Engine], ...] = ()
 
+    def __post_init__(self):
+        for name in ("engines", "dropped"):
+            parts = getattr(self, name)
+            pairs = isinstance(parts, tuple) and all(isinstance(part, tuple) and len(part) == 2 for part in parts)
+            pairs = pairs and all(isinstance(engine, Engine) for _, engine in parts)
+            allowed = "must be a tuple of (number, engine), as in ((1, STAGE_1),)"
+            refuse_unless(pairs, f"a burn's {name}", f"{parts!r:.60}", allowed)
+
     @property
     def thrust(self) -> float:
         """N."""
@@ -199,6 +207,8 @@ def check_rocket(rocket: Rocket):
         refuse_unless(getattr(rocket, name) > 0, f"a rocket's {name}", getattr(rocket, name), "must be positive")
     for name in ("payload", "rho0", "Cd", "S"):
         refuse_unless(getattr(rocket, name) >= 0, f"a rocket's {name}", getattr(rocket, name), "must not be negative")
+    allowed = f"must be above half of Re, {rocket.Re / 2:.6g} m: with less energy it lies on the ground"
+    refuse_unless(rocket.a > rocket.Re / 2, "a rocket's a", f"{rocket.a} m", allowed)
     refuse_unless(0 <= rocket.e < 1, "a rocket's e", rocket.e, "must be at least 0 and below 1, a closed orbit")
     refuse_unless(0 <= rocket.i <= 180, "a rocket's i", rocket.i, "must be between 0 and 180 degrees")
     refuse_unless(-90 < rocket.latitude < 90, "a rocket's latitude", rocket.latitude, "must be between -90 and 90")
@@ -211,7 +221,7 @@ def check_rocket(rocket: Rocket):
     refuse_unless(thrust > weight, "the thrust of burns[0]", f"{thrust:.6g} N", allowed)
     if min(rocket.i, 180 - rocket.i) < abs(rocket.latitude):
         needs = f"below the launch latitude {rocket.latitude}: the plane can only be reached by a dog-leg"
-        warnings.warn(f"a rocket's i is {rocket.i} degrees, {needs}", stacklevel=4)
+        warnings.warn(f"a rocket's i is {rocket.i} degrees, {needs}")  # noqa: B028 - from one place: it is said once
 
 
 def check_burns(rocket: Rocket):
@@ -227,6 +237,8 @@ def check_burns(rocket: Rocket):
         aboard = engines_aboard(rocket, k)
         for number, engine in burn.engines:
             field, has = f"the number of an engine in burns[{k}].engines", aboard.get(engine, 0)
+            allowed = "must be dropped by this burn or a later one, or burn in the last: it is not aboard"
+            refuse_unless(has > 0, f"an engine of burns[{k}]", engine, allowed)
             allowed = f"must be positive and at most {has}: so many are dropped then or later, or are of the last burn"
             refuse_unless(0 < number <= has, field, number, allowed)
             used[engine] = used.get(engine, 0.0) + number * engine.flow(rocket.table_isp) * (burn.end - start)

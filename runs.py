@@ -255,6 +255,7 @@ def load_checkpoint(agent, args, saved):
     """Put the weights of --checkpoint, if there is one, into a new agent; one line if they do not fit."""
     if args.checkpoint is None or args.resume is not None:
         return
+    ours = dict(agent.named_buffers())
     expected = {name: tuple(tensor.shape) for name, tensor in agent.state_dict().items()}
     shapes = {name: array.shape for name, array in saved["tensors"].items()}
     if differing := [name for name in {**expected, **shapes} if expected.get(name) != shapes.get(name)]:
@@ -262,6 +263,10 @@ def load_checkpoint(agent, args, saved):
         theirs, ours = (shape.get(name, "missing") for shape in (shapes, expected))
         why = f"{name} is {theirs} in the file and {ours} in this script"
         fail(f"--checkpoint {args.checkpoint}: does not fit its own args, BUFFERS or features ({why})")
+    for name, constant in ours.items():
+        if not torch.allclose(constant.cpu(), torch.from_numpy(saved["tensors"][name]), rtol=1e-6):
+            print(f"--checkpoint {args.checkpoint}: its {name} is not that of {args.env_id} now; it flies by its own")
+            break
     try:
         agent.load_state_dict({name: torch.from_numpy(array) for name, array in saved["tensors"].items()})
     except (RuntimeError, TypeError) as error:  # a type that torch does not have

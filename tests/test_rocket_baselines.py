@@ -116,7 +116,7 @@ def test_optimum_for_the_orbit_reached():
 
 def test_every_solve_is_ready_to_fly(command, flights):
     _, numbers, arrays = command
-    assert set(arrays) == {f"{key}_{name}" for key in VEHICLES for name in "tu"}
+    assert set(arrays) >= {f"{key}_{name}" for key in VEHICLES for name in "tu"}  # and those of a user's own
     for key, flight in flights.items():
         assert set(numbers[key]) >= KEYS and numbers[key]["status"] == "Solve_Succeeded"
         # the fixed-time programs have the environment's own steps; the others are collocated, and held over its steps
@@ -175,7 +175,7 @@ def refuse(case):
     raise AssertionError(f"{case.key} was solved anew")
 
 
-@pytest.mark.parametrize("env_id", ROCKETS)
+@pytest.mark.parametrize("env_id", ["RocketAscent-v0", "RocketAscentCutoff-v0", "TwoStageLEO-v0"])
 def test_reference_is_the_solve(command, flights, shipped, monkeypatch, env_id):
     monkeypatch.setattr(baselines, "solve_ascent", refuse)
     _, numbers, _ = command
@@ -240,11 +240,11 @@ def test_results_hold_the_command_s_files(command):
     """What is shipped in results/ is what the command gives; up to rounding on another machine."""
     _, numbers, arrays = command
     kept = json.loads((baselines.RESULTS / "rocket_reference.json").read_text())
-    assert kept.keys() == numbers.keys()
+    assert kept.keys() <= numbers.keys()
     for key in VEHICLES:
         assert kept[key]["final_mass_kg"] == pytest.approx(numbers[key]["final_mass_kg"], rel=1e-9)
     with np.load(baselines.RESULTS / "rocket_reference.npz") as file:
-        assert set(file) == set(arrays)
+        assert set(file) <= set(arrays)
         for key in FREE:
             np.testing.assert_allclose(file[f"{key}_t"], arrays[f"{key}_t"], rtol=0, atol=1e-5)
 
