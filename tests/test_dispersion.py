@@ -522,7 +522,7 @@ def test_bad_draws_are_refused(draw, message):
 
 
 def test_bad_options_are_refused():
-    with pytest.raises(BadInput, match="'draw'.*no options but with dispersion"):
+    with pytest.raises(BadInput, match="'draw'.*without dispersion a rocket has no options"):
         gym.make_vec(CUTOFF).reset(options={"draw": np.zeros((1, 16))})
     with pytest.raises(BadInput, match="the only one is 'draw'"):
         make(CUTOFF).reset(options={"x0": 1})
