@@ -581,8 +581,8 @@ class RocketVectorEnv(BatchedEnv):
         self.dispersion, self.observe_draw, self.observe_mass = dispersion, observe_draw, observe_mass
         self.mass_weight, self.trajectory_weight, self.guidance_weight, self.guidance = 0.0, 0.0, 0.1, "none"
         self.terminal_scale = TERMINAL_SCALE
-        self._build(num_envs)
         super().__init__(num_envs, 1, *self._spaces(), render_mode)
+        self._build()
         self.end_time = self.rocket.end_time  # sets episode_steps, too
         self._axes = target_axes(self.rocket)
         h, e = target_orbit(self.rocket.target, self.rocket.mu)
@@ -592,21 +592,15 @@ class RocketVectorEnv(BatchedEnv):
         self.u = np.zeros((3, num_envs))  # the direction of the step before, in ECI
         self._parts = np.zeros((len(self.PARTS), num_envs))
         self._distance, self._energy, self.time, self._max_altitude = np.zeros((4, num_envs))
-        self._phase, self._arc_index = np.zeros(
-            (2, num_envs), dtype=np.int64
-        )  # a step's phase; an arc is a burn or less
         self._crashed = np.zeros(num_envs, dtype=bool)
         self._everyone = np.arange(num_envs)
 
-    def _build(self, num_envs):
+    def _build(self):
         """The vehicles: all alike until an episode draws its own."""
-        self.draw = np.zeros((num_envs, len(draw_names(self.rocket))))
-        self._draw_bounds = draw_bounds(self.rocket, self.dispersion)
-        self.vehicles = nominal_vehicles(self.rocket, num_envs)
-        self._largest = self.vehicles  # of all that may be drawn
+        self.vehicles = nominal_vehicles(self.rocket, self.num_envs)
+        self.draw = np.zeros((self.num_envs, len(draw_names(self.rocket))))
         if self.dispersion:
             self.vehicles = draw_vehicles(self.rocket, self.dispersion, self.draw)
-            self._largest = draw_vehicles(self.rocket, self.dispersion, largest_draw(self.rocket, self.dispersion))
             # of the flight computer: by burn the nominal mass at its beginning and the flow
             ends, flow, dropped = (getattr(self.vehicles, name)[:-1, 0] for name in ("end", "flow", "dropped"))
             burnt = flow[:-1] * np.diff(ends[:-1], prepend=0.0)
@@ -614,7 +608,10 @@ class RocketVectorEnv(BatchedEnv):
             self._seen_flow = flow.copy()  # drawn flows will be written where it lies
 
     def _spaces(self):
-        """The spaces of one environment."""
+        """The spaces of one environment, which hold all that may be drawn."""
+        self._draw_bounds, self._largest = draw_bounds(self.rocket, self.dispersion), nominal_vehicles(self.rocket, 1)
+        if self.dispersion:
+            self._largest = draw_vehicles(self.rocket, self.dispersion, largest_draw(self.rocket, self.dispersion))
         r_max, v_max = reachable(self.rocket, self.dispersion)
         scores = self._draw_bounds if self.observe_draw else []
         latest = max(self._largest.burn_out.max(), self.rocket.end_time)
@@ -634,6 +631,8 @@ class RocketVectorEnv(BatchedEnv):
             raise ValueError(f"end_time is {value} s; it must be positive and at most {self.rocket.end_time}")
         self._end_time = float(value)
         self.episode_steps = int(self._set_ends(self._largest).max())
+        # without dispersion all flights share their steps, worked out here for the one vehicle
+        self._table = None if self.dispersion else self._work_out(np.arange(self.episode_steps + 1), self._largest)
         self._set_ends(self.vehicles)
 
     def _set_ends(self, vehicles):
@@ -645,7 +644,8 @@ class RocketVectorEnv(BatchedEnv):
 
     def _start(self, mask, options):
         if options and not (self.dispersion and options.keys() == {"draw"}):
-            raise BadInput(f"reset options are {options!r}; {self._allowed_options()}")
+            allowed = "the only one is 'draw'" if self.dispersion else "without dispersion a rocket has no options"
+            raise BadInput(f"reset options are {options!r}; {allowed}")
         if self.guidance not in REFERENCE_PITCH:
             raise ValueError(f"guidance is {self.guidance!r}; it must be one of {', '.join(REFERENCE_PITCH)}")
         if not 0 < self.terminal_scale < np.inf:
@@ -656,14 +656,8 @@ class RocketVectorEnv(BatchedEnv):
         self.y[6, mask] = self.vehicles.mass[mask]
         self._parts[:, mask] = self.u[:, mask] = 0.0
         self._max_altitude[mask] = self.time[mask] = 0.0
-        self._phase[mask] = self._arc_index[mask] = 0
         distance, energy = self._progress()
         self._distance[mask], self._energy[mask] = distance[mask], energy[mask]
-
-    def _allowed_options(self):
-        return (
-            "the only one is 'draw'" if self.dispersion else "a rocket has one start and no options but with dispersion"
-        )
 
     def _launch(self, mask, given):
         """Vehicles for the environments in `mask`: of the given draws (N, k), else of their own."""
@@ -697,25 +691,40 @@ class RocketVectorEnv(BatchedEnv):
         return np.abs(error).sum(axis=0), specific_energy(self.y, self.rocket.mu)
 
     def _observe(self):
-        obs = np.empty((self.num_envs, 9 + self.observe_draw * self.draw.shape[1]))
-        obs[:, :7], obs[:, 9:] = self.y.T, self.draw[:, : obs.shape[1] - 9]
+        obs = np.empty(self.observation_space.shape)
+        obs[:, :7] = self.y.T
+        if self.observe_draw:
+            obs[:, 9:] = self.draw
         if self.dispersion and not self.observe_mass:
             obs[:, 6] = self._computed_mass()
-        time = np.where(self.t == self._steps, self._latest, self.rocket.dt * self.t)
-        obs[:, 7] = (1 - time / self.rocket.end_time) * self.observe_phase
-        obs[:, 8] = self._phase / max(self._last_phase, 1) * self.observe_phase
+        clock, _ = self._schedule()
+        obs[:, 7:9] = clock[2:].T
         return obs
+
+    def _schedule(self):
+        """Of the running steps, as `_work_out` has it."""
+        if self._table is None:
+            return self._work_out(self.t, self.vehicles)
+        clock, arc = self._table
+        return clock[:, self.t], arc[self.t]
+
+    def _work_out(self, t, vehicles):
+        """Begin and end (s), t_norm and phi as observed before the steps t (N,), (4, N); the arcs they begin in, (N,).
+
+        After an episode's last step phi is still that one's.
+        """
+        dt, ends = self.rocket.dt, vehicles.end
+        time, end = (np.where(k >= self._steps, self._latest, dt * k) for k in (t, t + 1))
+        arc = (ends <= dt * np.minimum(t, self._steps - 1)).sum(axis=0)
+        phi = np.minimum(arc, self._last_phase) / max(self._last_phase, 1)
+        t_norm = 1 - time / self.rocket.end_time
+        return np.array([time, end, t_norm * self.observe_phase, phi * self.observe_phase]), arc
 
     def _computed_mass(self):
         """The flight computer's mass (N,) in kg: the nominal burn's, counted from the staging that has just been."""
-        burn = np.minimum(self._arc_index, self._last_phase)
+        burn = (self.vehicles.end[: self._last_phase] <= self.time).sum(axis=0)
         began = np.where(burn > 0, self.vehicles.end[burn - 1, self._everyone], 0.0)
         return np.maximum(self._seen_mass[burn] - self._seen_flow[burn] * (self.time - began), self.rocket.dry_mass)
-
-    def _phase_at(self, t):
-        """The phases (N,), 0-based, in which the steps t begin; behind an episode's last step it is that one's."""
-        begin = self.rocket.dt * np.minimum(t, self._steps - 1)
-        return (self.vehicles.end[: self._last_phase] <= begin).sum(axis=0)
 
     def _directions(self, actions):
         """Unit thrust directions in ECI (3, N) of actions (N, 3); BadInput names the first of length zero."""
@@ -732,42 +741,43 @@ class RocketVectorEnv(BatchedEnv):
 
     def _advance(self, actions):
         t, u, before = self.t, self._directions(actions), self.y
-        begin = self.rocket.dt * t
-        done = t + 1 == self._steps
-        duration = np.where(done, self._latest, self.rocket.dt * (t + 1)) - begin
-        self.y, arc = self._fly(before, u, begin, duration, self._everyone, self._arc_index)
+        (begin, end, *_), arc = self._schedule()
+        duration, phase, done = end - begin, np.minimum(arc, self._last_phase), t + 1 == self._steps
+        self.y = self._fly(before, u, begin, end, duration, self._everyone, arc)
         if self.cutoff:
             energy = specific_energy(self.y, self.rocket.mu)
-            reached = (self._phase == self._last_phase) & (energy >= self.rocket.target_energy)
+            reached = (phase == self._last_phase) & (energy >= self.rocket.target_energy)
             if reached.any():
-                self.y[:, reached], duration[reached] = self._cut(before, u, begin, duration, np.flatnonzero(reached))
+                step = before, u, begin, end, duration, self._everyone, arc
+                self.y[:, reached], duration[reached] = self._cut(*(part[..., reached] for part in step))
             done = done | reached
         altitude = np.sqrt((self.y[:3] ** 2).sum(axis=0)) - self.rocket.Re
         self._crashed = altitude < 0
         done = done | self._crashed
         self.time = begin + duration
         self._max_altitude = np.maximum(self._max_altitude, altitude)
-        rewards = self._reward(before, u, altitude, done)
-        self.u, self.t, self._arc_index = u, t + 1, arc
-        self._phase = self._phase_at(self.t)
+        rewards = self._reward(before, u, phase, altitude, done)
+        self.u, self.t = u, t + 1
         return rewards, done, self._final_info
 
-    def _fly(self, y, u, begin, duration, who, arc):
-        """States (7, n) `duration` s after `begin` (n,), u (3, n) held, and the arcs (n,) they are then in.
+    def _fly(self, y, u, begin, end, duration, who, arc):
+        """States (7, n) `duration` (n,) s after `begin` (n,) of steps that end at `end` (n,), u (3, n) held.
 
-        y (7, n): states of the environments `who` (n,), in the arcs `arc` (n,) at `begin`.
+        y (7, n): the states at `begin` of the environments `who` (n,), which are then in the arcs `arc` (n,).
         """
         event = self.vehicles.end[arc, who]
         until = event - begin
         thrust, flow = self.vehicles.thrust[arc, who], self.vehicles.flow[arc, who]
         y = self._arc(y, u, np.minimum(duration, until), who, thrust, flow)
-        passed = np.flatnonzero(duration >= until)
+        passed = np.flatnonzero(event <= end)
         if len(passed):
-            arc, late, gone = arc.copy(), (duration - until)[passed], who[passed]
-            y[6, passed] -= self.vehicles.dropped[arc[passed], gone]
-            flown = self._fly(y[:, passed], u[:, passed], event[passed], late, gone, arc[passed] + 1)
-            y[:, passed], arc[passed] = flown
-        return y, arc
+            # a duration is rounded: an event at the step's very end, which the next step takes as past, is not missed
+            passed = passed[(duration >= until - 1e-9)[passed]]
+            u, end, who, arc = u[:, passed], end[passed], who[passed], arc[passed]
+            y[6, passed] -= self.vehicles.dropped[arc, who]
+            late = np.maximum((duration - until)[passed], 0.0)
+            y[:, passed] = self._fly(y[:, passed], u, event[passed], end, late, who, arc + 1)
+        return y
 
     def _arc(self, y, u, dt, who, thrust, flow):
         """States (7, n) after dt (n,) seconds without an event: one RK4 step, several for a plunge into dense air.
@@ -797,19 +807,19 @@ class RocketVectorEnv(BatchedEnv):
             y_next[:, stiff] = y_sub
         return y_next
 
-    def _cut(self, before, u, begin, duration, reached):
-        """States (7, n) and times (n,) within the step at which those who `reached` the target's energy have just it.
+    def _cut(self, before, u, begin, end, duration, who, arc):
+        """States (7, n) and times (n,) within the step at which `who` reach the target's energy; the rest as `_fly`'s.
 
         Regula falsi with the Illinois change (Dowell and Jarratt, 1971). The energy grows almost linearly in a step, so
         that four evaluations reach rounding; six, for all alike, keep a row independent of the rest of the batch.
         """
-        before, u, begin, goal = before[:, reached], u[:, reached], begin[reached], self.rocket.target_energy
-        low, high, above = np.zeros(len(reached)), duration[reached], np.full(len(reached), -1)
+        goal = self.rocket.target_energy
+        low, high, above = np.zeros(len(who)), duration, np.full(len(who), -1)
         f_low = np.minimum(specific_energy(before, self.rocket.mu) - goal, -1e-300)  # beyond it at the start: cut there
-        f_high = specific_energy(self.y[:, reached], self.rocket.mu) - goal
+        f_high = specific_energy(self.y[:, who], self.rocket.mu) - goal
         for _ in range(6):
             time = low - f_low * (high - low) / (f_high - f_low)
-            y, _ = self._fly(before, u, begin, time, reached, self._arc_index[reached])
+            y = self._fly(before, u, begin, end, time, who, arc)
             f, above_before = specific_energy(y, self.rocket.mu) - goal, above
             above = f >= 0
             kept = above == above_before  # the same end twice: its value is halved
@@ -817,10 +827,10 @@ class RocketVectorEnv(BatchedEnv):
             low, high = np.where(above, low, time), np.where(above, time, high)
         return y, time
 
-    def _reward(self, before, u, altitude, done):
+    def _reward(self, before, u, phase, altitude, done):
         """The five parts of this step, added to their sums; returns what is paid, (N,): their total, R_terminal with
         `terminal_scale`."""
-        t, phase = self.t, self._phase
+        t = self.t
         distance, energy = self._progress()
         turn = np.sqrt(((u - self.u) ** 2).sum(axis=0)) * (t > 0)
         burnt = (before[6] - self.y[6]) * (phase == self._last_phase)

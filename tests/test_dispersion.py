@@ -15,6 +15,7 @@ from scipy.integrate import solve_ivp
 
 import envs
 from envs import DRAW, ROCKET, ROCKETS, BadInput, ascent, fly_rocket
+from rocket import engine_groups
 
 FIXED, CUTOFF, LEO = IDS = ["RocketAscent-v0", "RocketAscentCutoff-v0", "TwoStageLEO-v0"]
 LEO_DRAW = ["burn_rate_1", "burn_rate_2", "isp_1", "isp_2", "propellant_1", "propellant_2", "dry_mass_1", "dry_mass_2"]
@@ -103,6 +104,12 @@ def direction(env_id, t):
 
 def vector(env_id, z):
     return np.array([z[name] for name in (LEO_DRAW if env_id == LEO else DRAW)])
+
+
+def changed(name, value):
+    z = np.zeros(16)
+    z[DRAW.index(name)] = value
+    return z
 
 
 @cache
@@ -214,6 +221,49 @@ def test_the_first_to_run_out_ends_a_burn_and_none_burns_what_it_has_not():
     assert vehicles.mass[0] - burnt - dropped == pytest.approx(ROCKET.payload + 9e3, abs=1e-6)
 
 
+def test_burns_that_drop_nothing_end_at_their_nominal_time():
+    """Stage 1 burns on through one, and still counts its propellant from lift-off."""
+    *first, third, last = ROCKET.burns
+    rocket = replace(ROCKET, burns=(*first, envs.Burn(200.0, third.engines), third, last))
+    z = scores(CUTOFF)
+    vehicles, same = (envs.draw_vehicles(r, 1.0, vector(CUTOFF, z)[None]) for r in (rocket, ROCKET))
+    assert vehicles.end[2, 0] == pytest.approx(200.0, rel=1e-15)
+    np.testing.assert_allclose(np.delete(vehicles.end, 2, axis=0)[:-1], same.end[:-1], rtol=1e-14)
+    np.testing.assert_allclose(np.delete(vehicles.dropped, 2, axis=0), same.dropped, rtol=1e-14)
+    assert vehicles.dropped[2, 0] == 0 and (vehicles.mass, vehicles.burn_out) == (same.mass, same.burn_out)
+
+
+def test_a_stage_that_is_lit_twice_burns_what_it_has():
+    first = envs.Engine(20e3, 18e3, 1.5e6, 280.0, 100.0)
+    coast = envs.Engine(10.0, 0.0, 0.0, 300.0, 1.0)
+    top = envs.Engine(9e3, 8e3, 2e5, 300.0, 200.0)
+    burns = [envs.Burn(100.0, ((1, first),), ((1, first),)), envs.Burn(200.0, ((1, top),))]
+    burns += [envs.Burn(400.0, ((1, coast),), ((1, coast),)), envs.Burn(500.0, ((1, top),))]
+    rocket = replace(ROCKET, burns=tuple(burns), end_time=500.0)
+    names = envs.draw_names(rocket)
+    z = np.zeros((1, len(names)))
+    assert names[:3] == ("burn_rate_1", "burn_rate_2", "burn_rate_3")  # first, top, coast
+    z[0, [0, 1, names.index("propellant_2")]] = 2.0, -1.0, 1.5
+    vehicles = envs.draw_vehicles(rocket, 1.0, z)
+    lit = 100 / 1.01
+    out = 400 + 200 * 1.0045 / 0.995 - (200 - lit)
+    np.testing.assert_allclose(vehicles.end[:4, 0], [lit, 200, 400, out], rtol=1e-14)
+    assert vehicles.burn_out[0] == pytest.approx(out, rel=1e-14)
+    burnt = (vehicles.flow[:4, 0] * np.diff(vehicles.end[:4, 0], prepend=0.0)).sum()
+    left = vehicles.mass[0] - burnt - vehicles.dropped.sum()
+    assert left == pytest.approx(ROCKET.payload + 1e3, abs=1e-6) and vehicles.dropped[2, 0] == 10
+
+
+def test_since_when_boosters_of_one_type_burn():
+    x, top = envs.Engine(20e3, 18e3, 1.5e6, 280.0, 200.0), envs.Engine(9e3, 8e3, 2e5, 300.0, 100.0)
+    numbers = ((4, 1), (3, 3), (2, 2))  # burning and dropped: the first four outlive one of theirs, two are lit later
+    burns = [envs.Burn(100.0 * (k + 1), ((n, x),), ((gone, x),)) for k, (n, gone) in enumerate(numbers)]
+    rocket = replace(ROCKET, burns=(*burns, envs.Burn(400.0, ((1, top),))), end_time=400.0)
+    assert [(g.number, g.lit, g.part) for g in engine_groups(rocket)] == [
+        (1, (0,), 100), (3, (1, 0), 200), (2, (2,), 100), (1, (3,), 100)
+    ]  # fmt: skip
+
+
 @pytest.mark.parametrize("step", [0, 3, 17])
 def test_two_events_in_one_step_are_both_flown(step):
     """Two stages that leave 0.6 s apart, both within a step, flown once more by hand."""
@@ -294,11 +344,12 @@ def test_the_observed_mass_is_the_flight_computers():
 
 
 def test_the_flight_computer_never_shows_less_than_the_nominal_dry_mass():
-    z = np.zeros((1, len(DRAW)))
-    z[0, [DRAW.index("propellant_3"), DRAW.index("burn_rate_3")]] = 3.0, -3.0
-    seen = episode(make(CUTOFF), CUTOFF, {"draw": z})[0]
-    late = np.concatenate([episode(make(CUTOFF, table_isp=True), CUTOFF, {"draw": z})[0][:, 0, 6], seen[:, 0, 6]])
-    assert late.min() >= 6644
+    """A last stage lit early flies on longer than its nominal propellant would last."""
+    z = changed("burn_rate_2", 3.0) + changed("propellant_2", -3.0)
+    seen = episode(make(FIXED), FIXED, {"draw": [z]})[0][:, 0, 6]
+    lit = 261 * 0.991 / 1.015
+    assert lit + 700 < 956 and seen[-4:].tolist() == [6644.0] * 4
+    assert seen[475] == pytest.approx(4164 + 19300 - 16820 / 700 * (950 - lit), abs=1e-6)
 
 
 # --- dispersion 0 and 1 -----------------------------------------------------------------------------------------------
@@ -467,6 +518,33 @@ def test_wind_and_drag_of_a_flight():
     assert speed[3] < speed[0] - 1 and speed[4] > speed[0] + 1
 
 
+def plunge(batch, altitude, speed, mass, **options):
+    """The state (7,) after a step from a fall through dense air, late in the flight."""
+    batch.reset(**options)
+    batch.y[:, 0] = RE + altitude, 0.0, 0.0, -speed, OMEGA * RE + 100, 50.0, mass
+    batch.t[:] = 400
+    start = batch.y[:, 0].copy()
+    batch.advance([[1.0, 0.2, -0.3]])
+    return start, batch.y[:, 0].copy(), batch.u[:, 0]
+
+
+def test_a_plunge_is_cut_into_steps_by_the_flights_own_drag():
+    factor = 1 + 0.14 * 2.5
+    got = plunge(make(CUTOFF), 14e3, 1500.0, 2000.0, options={"draw": [changed("drag", 2.5)]})
+    heavy = replace(ROCKET, Cd=factor * ROCKET.Cd)
+    expected = plunge(gym.make_vec(CUTOFF, rocket=heavy, action_frame="local"), 14e3, 1500.0, 2000.0)
+    np.testing.assert_allclose(got[1], expected[1], rtol=1e-13, atol=1e-9)
+
+
+def test_a_plunge_through_the_wind_agrees_with_scipy():
+    z = scores(CUTOFF) | {"drag": -1.0, "wind_east": 3.0, "wind_north": -3.0}
+    start, y, u = plunge(make(CUTOFF), 14e3, 1500.0, 2000.0, options={"draw": [vector(CUTOFF, z)]})
+    expected = integrate(CUTOFF, z, start, 800.0, 802.0, u)
+    calm = integrate(CUTOFF, z | {"wind_east": 0.0, "wind_north": 0.0}, start, 800.0, 802.0, u)
+    assert np.linalg.norm(calm[3:6] - expected[3:6]) > 20
+    np.testing.assert_allclose(y[3:6], expected[3:6], rtol=0, atol=0.05)
+
+
 def test_ascent_takes_casadi_symbols_with_wind():
     casadi = pytest.importorskip("casadi")
     x, wind, factor = casadi.SX.sym("x", 7), casadi.SX.sym("w", 2), casadi.SX.sym("f")
@@ -486,12 +564,6 @@ def test_bad_dispersions_are_refused(value):
     for create in (gym.make_vec, gym.make):
         with pytest.raises(BadInput, match=r"^dispersion is .* must be a number from 0 to 100$"):
             create(CUTOFF, dispersion=value)
-
-
-def changed(name, value):
-    z = np.zeros(16)
-    z[DRAW.index(name)] = value
-    return z
 
 
 @pytest.mark.parametrize(
@@ -522,7 +594,7 @@ def test_bad_draws_are_refused(draw, message):
 
 
 def test_bad_options_are_refused():
-    with pytest.raises(BadInput, match="'draw'.*no options but with dispersion"):
+    with pytest.raises(BadInput, match="'draw'.*without dispersion a rocket has no options"):
         gym.make_vec(CUTOFF).reset(options={"draw": np.zeros((1, 16))})
     with pytest.raises(BadInput, match="the only one is 'draw'"):
         make(CUTOFF).reset(options={"x0": 1})
