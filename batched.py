@@ -1,0 +1,185 @@
+"""What every environment shares: the Runge-Kutta step, the batch of N flights, the single environment as a view of it.
+
+`envs.py` (double integrator, Van der Pol) and `rocket_env.py` build on it; every name here is also one of `envs`.
+"""
+
+from __future__ import annotations
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.error import ResetNeeded
+from gymnasium.spaces import Box
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from rocket import BadInput
+
+
+def rk4(f, x, u, dt):
+    """One classical Runge-Kutta step of x' = f(x, u) with the control held, x a tuple of components.
+
+    The paper's x_{k+1}, "performed using numerical methods such as Runge-Kutta schemes". Exact for the double
+    integrator: its solution is quadratic in dt.
+    """
+    k1 = f(x, u)
+    k2 = f(tuple(xi + 0.5 * dt * ki for xi, ki in zip(x, k1)), u)
+    k3 = f(tuple(xi + 0.5 * dt * ki for xi, ki in zip(x, k2)), u)
+    k4 = f(tuple(xi + dt * ki for xi, ki in zip(x, k3)), u)
+    return tuple(xi + dt / 6 * (a + 2 * (b + c) + d) for xi, a, b, c, d in zip(x, k1, k2, k3, k4))
+
+
+DRAWN = {"render_modes": ["rgb_array"], "render_fps": 15}
+
+
+class BatchedEnv(VectorEnv):
+    """What every problem shares: step counters, checks of the action, and autoreset in the same step.
+
+    A problem gives the spaces, `episode_steps` (the longest episode) and three methods:
+    `_start(mask, options)` puts the environments in `mask` at a start, `_observe()` returns (N, obs) float64, and
+    `_advance(actions)` flies one step and returns `(rewards (N,), terminated (N,), final)`, where `final()` gives the
+    `final_info` arrays of the finished episodes; it is only called when there is one. One that can be drawn has
+    `DRAWN` in its `metadata` and two more: `_snapshot()` returns time (N,) s, the control of the step before (N, m) and
+    state (N, n), arrays of their own, and `_make_sheet(animation)` the drawing.
+    """
+
+    metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
+
+    def __init__(
+        self,
+        num_envs: int,
+        episode_steps: int,
+        single_observation_space: Box,
+        single_action_space: Box,
+        render_mode: str | None = None,
+    ):
+        if num_envs < 1:
+            raise ValueError(f"num_envs is {num_envs}; it must be at least 1")
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            allowed = ", ".join(["None", *self.metadata["render_modes"]])
+            raise ValueError(f"render_mode is {render_mode!r}; it must be one of {allowed}")
+        self.render_mode, self._sheet = render_mode, None
+        self._trails = [[] for _ in range(num_envs)]  # of each running episode, only where it is rendered
+        self.num_envs, self.episode_steps = num_envs, episode_steps
+        self.single_observation_space = single_observation_space
+        self.single_action_space = single_action_space
+        self.observation_space = batch_space(single_observation_space, num_envs)
+        self.action_space = batch_space(single_action_space, num_envs)
+        self.t = np.zeros(num_envs, dtype=np.int64)  # steps flown in the running episode
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None):
+        """Start every environment anew; returns (N, obs) float64 and an empty info."""
+        super().reset(seed=seed)
+        self._restart(np.ones(self.num_envs, dtype=bool), options)
+        return self._observe(), {}
+
+    def step(self, actions):
+        """Fly one step and restart what ended; the ended episodes' last values are `final_obs` and `final_info`."""
+        obs, rewards, terminated, final = self.advance(actions)
+        info = {}
+        if terminated.any():
+            final_info = {**final, **{f"_{key}": terminated.copy() for key in final}}
+            info = {"final_obs": obs, "_final_obs": terminated.copy()}
+            info |= {"final_info": final_info, "_final_info": terminated.copy()}
+            self._restart(terminated, None)
+            obs = self._observe()
+        return obs, rewards, terminated, np.zeros(self.num_envs, dtype=bool), info
+
+    def advance(self, actions):
+        """Fly one step without autoreset: `(obs, rewards, terminated, final_info)`. BadInput names a bad action."""
+        actions = np.asarray(actions)
+        if actions.dtype.kind not in "fiu":
+            raise BadInput(f"actions are of type {actions.dtype}; they must be real numbers")
+        actions = actions.astype(np.float64)
+        if actions.shape != self.action_space.shape:
+            raise BadInput(f"actions have shape {actions.shape}; expected {self.action_space.shape}")
+        if not np.isfinite(actions).all():
+            bad = int(np.flatnonzero(~np.isfinite(actions).all(axis=1))[0])
+            raise BadInput(f"action of env {bad} at step {self.t[bad]} is {actions[bad].tolist()}; it must be finite")
+        rewards, terminated, final = self._advance(actions)
+        if self.render_mode is not None:
+            self._record(np.ones(self.num_envs, dtype=bool))
+        return self._observe(), rewards, terminated, final() if terminated.any() else {}
+
+    def render(self):
+        """The running episodes so far, a tuple of N frames, uint8 (H, W, 3); without a render mode a warning and None.
+
+        An episode that has just ended is the next one already, as autoreset in the same step has it.
+        """
+        if self.render_mode is None:
+            warn_of_no_mode(self)
+            return None
+        if not self._trails[0]:
+            raise ResetNeeded("nothing to render: call reset() first")
+        import animation  # Matplotlib takes a quarter of a second that only a drawing should cost
+
+        self._sheet = self._sheet or self._make_sheet(animation)
+        columns = [[np.array(column) for column in zip(*trail)] for trail in self._trails]
+        return tuple(self._sheet.frame(animation.Flight(t, u[1:], y)) for t, u, y in columns)
+
+    def _restart(self, mask, options):
+        self.t[mask] = 0
+        self._start(mask, options or {})
+        if self.render_mode is not None:
+            for k in np.flatnonzero(mask):
+                self._trails[k] = []
+            self._record(mask)
+
+    def _record(self, mask):
+        """Add time, control of the step before, and state to the trails of the environments in `mask`."""
+        time, control, state = self._snapshot()
+        for k in np.flatnonzero(mask):
+            self._trails[k].append((time[k], control[k], state[k]))
+
+
+def warn_of_no_mode(env):
+    """Gymnasium's usual warning where `render` is called without a render mode."""
+    env_id = env.spec.id if env.spec else "id"
+    gym.logger.warn(
+        "You are calling render method without specifying any render mode. You can specify the render_mode at "
+        f'initialization, e.g. gym.make("{env_id}", render_mode="rgb_array")'
+    )
+
+
+class SingleEnv(gym.Env):
+    """One environment: a thin view of a batch of one (`batch`), without its autoreset.
+
+    A step without a reset before it, also the one after an episode's end, raises `gymnasium.error.ResetNeeded`.
+    """
+
+    def __init__(self, batch: BatchedEnv):
+        self.batch, self.render_mode = batch, batch.render_mode
+        self.metadata = {key: value for key, value in batch.metadata.items() if key != "autoreset_mode"}
+        self._running = False  # from a reset to the end of its episode
+        self.observation_space, self.action_space = batch.single_observation_space, batch.single_action_space
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None):
+        """Start anew, `options` being the batch's without its first axis; returns the observation and an empty info."""
+        super().reset(seed=seed)
+        self._running = False  # also where the options are refused
+        if options and "x0" in options:
+            options = {**options, "x0": np.asarray(options["x0"])[None]}
+        if options and "draw" in options:
+            options = {**options, "draw": [options["draw"]]}
+        obs, info = self.batch.reset(seed=seed, options=options)
+        self._running = True
+        return obs[0], info
+
+    def step(self, action):
+        """Fly one step; the last one's info holds what `final_info` holds in the batch."""
+        if not self._running:
+            raise ResetNeeded("no episode is running: call reset() first, and again after an episode has ended")
+        obs, rewards, terminated, final = self.batch.advance(np.asarray(action)[None])
+        self._running = not terminated[0]
+        return obs[0], float(rewards[0]), bool(terminated[0]), False, {key: value[0] for key, value in final.items()}
+
+    def render(self):
+        """The episode so far, uint8 (H, W, 3); without a render mode a warning and None."""
+        if self.render_mode is None:
+            warn_of_no_mode(self)
+            return None
+        return self.batch.render()[0]
+
+
+def of_batch(name: str, doc: str) -> property:
+    """A property of a single environment that is its batch's."""
+    return property(lambda env: getattr(env.batch, name), lambda env, value: setattr(env.batch, name, value), doc=doc)

@@ -1,0 +1,467 @@
+"""The rockets' environment: time grid, events, RK4, cut-off, dispersed vehicles. `rocket.py` is best read before it.
+
+Every name here is also one of `envs`, which registers the ids.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.spaces import Box
+
+from batched import DRAWN, BatchedEnv, SingleEnv, of_batch, rk4
+from rocket import (
+    DISPERSION,
+    LARGEST_DISPERSION,
+    PAPER_MISSION,
+    REFERENCE_PITCH,
+    ROCKETS,
+    TERMINAL_SCALE,
+    BadInput,
+    Mission,
+    Rocket,
+    ascent,
+    delta_v,
+    draw_bounds,
+    draw_names,
+    draw_vehicles,
+    guidance_reward,
+    largest_draw,
+    local_frame,
+    nominal_vehicles,
+    orbit_vectors,
+    orbital_elements,
+    orbital_reward,
+    penalties,
+    precision_points,
+    refuse_unless,
+    specific_energy,
+    target_axes,
+    target_orbit,
+    terminal_error,
+    terminal_reward,
+    trajectory_reward,
+)
+
+ACTION_FRAMES = ("eci", "local")
+STIFF = 0.25  # drag's rate |D| / (m |v_rel|) times the step, from which a step is cut
+
+
+class RocketVectorEnv(BatchedEnv):
+    """N launches of a mission's rocket into its orbit, steered by the thrust direction; 2 s steps, exact events.
+
+    Observation: [r (3) m, v (3) m/s, m kg, t_norm, phi] in ECI, t_norm = 1 - t / end_time (961 s), phi in 0 to 1 the
+    phase at the step's start (the paper's 0 to 3, over 3; a burn is a phase). Action: the thrust direction, any length
+    but 0 (BadInput), normalised here; with `action_frame="local"` by (up, along-track, cross-track of the target plane)
+    at the step's start, then held in ECI. A step is one RK4 step between events: staging, a stage that runs dry
+    (`table_isp`), the end of the episode.
+
+    With `dispersion` k > 0 no flight is like another: each episode draws standard scores, clipped at +-3 (see
+    `draw_bounds`), in the order of `draw_names`, and flies the vehicle of `draw_vehicles`, k times `DISPERSION` from
+    the nominal one. `reset(options={"draw": z})`, z (N, k), gives them, also beyond 3; BadInput refuses what no vehicle
+    can be. Events and phases are then each flight's own. The mass that is observed is the flight computer's: the
+    nominal schedule from the last staging on; `observe_mass` shows the true one. `observe_draw` puts the scores behind
+    the nine.
+
+    With a `cutoff` mission (ours: the paper fixes the final time) the engine stops when, in the last phase, the energy
+    reaches the target's: the root within the step, to 1e-10, ends the episode. An altitude below 0 ends it too (crash),
+    and so does `end_time`; with dispersion the burn-out of a flight's own last stage does in its place, and t_norm may
+    end below 0 (unless `end_time` is another than the rocket's, or that one before the last burn's end).
+
+    Reward: the sum of the five parts R_orbital, R_trajectory, R_guidance, R_penalties and R_terminal, each a function
+    of `rocket.py`. `final_info`, (N,) each: `error_norm` (and `error` (N, 6), the terminal error in ECI), `a_km e i_deg
+    raan_deg argp_deg final_mass_kg final_time_s max_altitude_km` (at the steps' ends), the parts' sums,
+    `episodic_return`, `points` (`precision_points`), `crashed`, with dispersion `draw` (N, k).
+
+    Attributes that only training changes, to be set before a `reset`: `mass_weight`, `trajectory_weight`,
+    `guidance_weight`, `guidance` (a key of `REFERENCE_PITCH`), `end_time` (s, at most the last phase's end) and
+    `terminal_scale`, a curriculum: the *reward* pays R_terminal with it, `final_info` reports it with `TERMINAL_SCALE`.
+    """
+
+    metadata = {**BatchedEnv.metadata, **DRAWN}
+    PARTS = ("R_orbital", "R_trajectory", "R_guidance", "R_penalties", "R_terminal")
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        mission: Mission = PAPER_MISSION,
+        action_frame: str = "eci",
+        table_isp: bool = False,
+        observe_phase: bool = True,
+        render_mode: str | None = None,
+        dispersion: float = 0.0,
+        observe_draw: bool = False,
+        observe_mass: bool = False,
+    ):
+        if action_frame not in ACTION_FRAMES:
+            raise ValueError(f"action_frame is {action_frame!r}; it must be one of {', '.join(ACTION_FRAMES)}")
+        number = isinstance(dispersion, int | float | np.number) and 0 <= dispersion <= LARGEST_DISPERSION
+        refuse_unless(number, "dispersion", dispersion, f"must be a number from 0 to {LARGEST_DISPERSION:.0f}")
+        self.mission = flown_mission(mission, table_isp=table_isp)
+        self.rocket, self.cutoff = self.mission.rocket, mission.cutoff
+        self._last_phase = len(self.rocket.burns) - 1
+        self.action_frame, self.observe_phase = action_frame, observe_phase
+        self.dispersion, self.observe_draw, self.observe_mass = dispersion, observe_draw, observe_mass
+        self.mass_weight, self.trajectory_weight, self.guidance_weight, self.guidance = 0.0, 0.0, 0.1, "none"
+        self.terminal_scale = TERMINAL_SCALE
+        super().__init__(num_envs, 1, *self._spaces(), render_mode)
+        self._build()
+        self.end_time = self.rocket.end_time  # sets episode_steps, too
+        self._axes = target_axes(self.rocket)
+        h, e = target_orbit(self.rocket.target, self.rocket.mu)
+        self._h_axes = self._axes / np.linalg.norm(h)
+        self._target = np.concatenate([self._h_axes @ h, self._axes @ e])[:, None]
+        self.y = np.repeat(self.rocket.x0[:, None], num_envs, axis=1)  # (7, N)
+        self.u = np.zeros((3, num_envs))  # the direction of the step before, in ECI
+        self._parts = np.zeros((len(self.PARTS), num_envs))
+        self._distance, self._energy, self.time, self._max_altitude = np.zeros((4, num_envs))
+        self._crashed = np.zeros(num_envs, dtype=bool)
+        self._everyone = np.arange(num_envs)
+
+    def _build(self):
+        """The vehicles: all alike until an episode draws its own."""
+        self.vehicles = nominal_vehicles(self.rocket, self.num_envs)
+        self.draw = np.zeros((self.num_envs, len(draw_names(self.rocket))))
+        if self.dispersion:
+            self.vehicles = draw_vehicles(self.rocket, self.dispersion, self.draw)
+            # of the flight computer: by burn the nominal mass at its beginning and the flow
+            ends, flow, dropped = (getattr(self.vehicles, name)[:-1, 0] for name in ("end", "flow", "dropped"))
+            burnt = flow[:-1] * np.diff(ends[:-1], prepend=0.0)
+            self._seen_mass = self.vehicles.mass[0] - np.append(0.0, np.cumsum(burnt + dropped[:-1]))
+            self._seen_flow = flow.copy()  # drawn flows will be written where it lies
+
+    def _spaces(self):
+        """The spaces of one environment, which hold all that may be drawn."""
+        self._draw_bounds, self._largest = draw_bounds(self.rocket, self.dispersion), nominal_vehicles(self.rocket, 1)
+        if self.dispersion:
+            self._largest = draw_vehicles(self.rocket, self.dispersion, largest_draw(self.rocket, self.dispersion))
+        r_max, v_max = reachable(self.rocket, self.dispersion)
+        scores = self._draw_bounds if self.observe_draw else []
+        latest = max(self._largest.burn_out.max(), self.rocket.end_time)
+        high = np.array([*[r_max] * 3, *[v_max] * 3, self._largest.mass[0], 1.0, 1.0, *scores])
+        low = -high
+        low[6:9] = 0.0, min(0.0, 1 - latest / self.rocket.end_time) if self.dispersion else 0.0, 0.0
+        return Box(low, high, dtype=np.float64), Box(-1.0, 1.0, (3,), dtype=np.float64)
+
+    @property
+    def end_time(self) -> float:
+        """Seconds after which an episode ends at the latest; the last step is shorter where 2 s do not divide it."""
+        return self._end_time
+
+    @end_time.setter
+    def end_time(self, value: float):
+        if not 0 < value <= self.rocket.end_time:
+            raise ValueError(f"end_time is {value} s; it must be positive and at most {self.rocket.end_time}")
+        self._end_time = float(value)
+        self.episode_steps = int(self._set_ends(self._largest).max())
+        # without dispersion all flights share their steps, worked out here for the one vehicle
+        self._table = None if self.dispersion else self._work_out(np.arange(self.episode_steps + 1), self._largest)
+        self._set_ends(self.vehicles)
+
+    def _set_ends(self, vehicles):
+        """When the episodes of these vehicles end at the latest: sets and returns the number of their steps."""
+        own = self.dispersion and self.cutoff and self._end_time == self.rocket.end_time == self.rocket.burns[-1].end
+        self._latest = vehicles.burn_out if own else np.full(len(vehicles.mass), self._end_time)  # s
+        self._steps = np.maximum(np.ceil(self._latest / self.rocket.dt - 1e-9), 1.0).astype(np.int64)
+        return self._steps
+
+    def _start(self, mask, options):
+        if options and not (self.dispersion and options.keys() == {"draw"}):
+            allowed = "the only one is 'draw'" if self.dispersion else "without dispersion a rocket has no options"
+            raise BadInput(f"reset options are {options!r}; {allowed}")
+        if self.guidance not in REFERENCE_PITCH:
+            raise ValueError(f"guidance is {self.guidance!r}; it must be one of {', '.join(REFERENCE_PITCH)}")
+        if not 0 < self.terminal_scale < np.inf:
+            raise ValueError(f"terminal_scale is {self.terminal_scale}; it must be positive and finite")
+        if self.dispersion:
+            self._launch(mask, options.get("draw"))
+        self.y[:, mask] = self.rocket.x0[:, None]
+        self.y[6, mask] = self.vehicles.mass[mask]
+        self._parts[:, mask] = self.u[:, mask] = 0.0
+        self._max_altitude[mask] = self.time[mask] = 0.0
+        distance, energy = self._progress()
+        self._distance[mask], self._energy[mask] = distance[mask], energy[mask]
+
+    def _launch(self, mask, given):
+        """Vehicles for the environments in `mask`: of the given draws (N, k), else of their own."""
+        if given is None:
+            draw = self.np_random.standard_normal((int(mask.sum()), self.draw.shape[1]))
+            draw = np.clip(draw, -self._draw_bounds, self._draw_bounds)
+        else:
+            draw = self._checked_draw(given)[mask]
+        drawn = draw_vehicles(self.rocket, self.dispersion, draw)  # before anything is changed: it may be refused
+        self.draw[mask] = draw
+        for mine, new in zip(self.vehicles, drawn):
+            mine[..., mask] = new
+        self.episode_steps = max(self.episode_steps, int(self._set_ends(self.vehicles).max()))
+
+    def _checked_draw(self, given):
+        """The draws of `reset` (N, k), float64; BadInput where they are none."""
+        allowed = f"must hold finite numbers, of shape {self.draw.shape}: {', '.join(draw_names(self.rocket))}"
+        try:
+            draw = np.array(given, dtype=np.float64)
+        except (TypeError, ValueError):
+            draw = np.empty(0)
+        refuse_unless(draw.shape == self.draw.shape, "options['draw']", f"of shape {draw.shape}", allowed)
+        bad = draw[~np.isfinite(draw)]
+        refuse_unless(not len(bad), "an entry of options['draw']", bad[:1].sum(), allowed)
+        return draw
+
+    def _progress(self):
+        """The distance L to the target orbit (see `orbital_reward`) and the specific energy, both (N,)."""
+        h, e = orbit_vectors(self.y, self.rocket.mu)
+        error = np.concatenate([self._h_axes @ h, self._axes @ e]) - self._target
+        return np.abs(error).sum(axis=0), specific_energy(self.y, self.rocket.mu)
+
+    def _observe(self):
+        obs = np.empty(self.observation_space.shape)
+        obs[:, :7] = self.y.T
+        if self.observe_draw:
+            obs[:, 9:] = self.draw
+        if self.dispersion and not self.observe_mass:
+            obs[:, 6] = self._computed_mass()
+        clock, _ = self._schedule()
+        obs[:, 7:9] = clock[2:].T
+        return obs
+
+    def _schedule(self):
+        """Of the running steps, as `_work_out` has it."""
+        if self._table is None:
+            return self._work_out(self.t, self.vehicles)
+        clock, arc = self._table
+        return clock[:, self.t], arc[self.t]
+
+    def _work_out(self, t, vehicles):
+        """Begin and end (s), t_norm and phi as observed before the steps t (N,), (4, N); the arcs they begin in, (N,).
+
+        After an episode's last step phi is still that one's.
+        """
+        dt, ends = self.rocket.dt, vehicles.end
+        time, end = (np.where(k >= self._steps, self._latest, dt * k) for k in (t, t + 1))
+        arc = (ends <= dt * np.minimum(t, self._steps - 1)).sum(axis=0)
+        phi = np.minimum(arc, self._last_phase) / max(self._last_phase, 1)
+        t_norm = 1 - time / self.rocket.end_time
+        return np.array([time, end, t_norm * self.observe_phase, phi * self.observe_phase]), arc
+
+    def _computed_mass(self):
+        """The flight computer's mass (N,) in kg: the nominal burn's, counted from the staging that has just been."""
+        burn = (self.vehicles.end[: self._last_phase] <= self.time).sum(axis=0)
+        began = np.where(burn > 0, self.vehicles.end[burn - 1, self._everyone], 0.0)
+        return np.maximum(self._seen_mass[burn] - self._seen_flow[burn] * (self.time - began), self.rocket.dry_mass)
+
+    def _directions(self, actions):
+        """Unit thrust directions in ECI (3, N) of actions (N, 3); BadInput names the first of length zero."""
+        largest = np.abs(actions).max(axis=1)
+        if not largest.all():
+            bad = int(np.argmin(largest))
+            raise BadInput(f"action of env {bad} at step {self.t[bad]} is [0, 0, 0]; a direction must have a length")
+        u = actions.T / largest  # before squaring: neither overflow nor underflow
+        u /= np.sqrt((u * u).sum(axis=0))
+        if self.action_frame == "eci":
+            return u
+        up, along, cross = local_frame(self.y, self._axes[2])
+        return up * u[0] + along * u[1] + cross * u[2]
+
+    def _advance(self, actions):
+        t, u, before = self.t, self._directions(actions), self.y
+        (begin, end, *_), arc = self._schedule()
+        duration, phase, done = end - begin, np.minimum(arc, self._last_phase), t + 1 == self._steps
+        self.y = self._fly(before, u, begin, end, duration, self._everyone, arc)
+        if self.cutoff:
+            energy = specific_energy(self.y, self.rocket.mu)
+            reached = (phase == self._last_phase) & (energy >= self.rocket.target_energy)
+            if reached.any():
+                step = before, u, begin, end, duration, self._everyone, arc
+                self.y[:, reached], duration[reached] = self._cut(*(part[..., reached] for part in step))
+            done = done | reached
+        altitude = np.sqrt((self.y[:3] ** 2).sum(axis=0)) - self.rocket.Re
+        self._crashed = altitude < 0
+        done = done | self._crashed
+        self.time = begin + duration
+        self._max_altitude = np.maximum(self._max_altitude, altitude)
+        rewards = self._reward(before, u, phase, altitude, done)
+        self.u, self.t = u, t + 1
+        return rewards, done, self._final_info
+
+    def _fly(self, y, u, begin, end, duration, who, arc):
+        """States (7, n) `duration` (n,) s after `begin` (n,) of steps that end at `end` (n,), u (3, n) held.
+
+        y (7, n): the states at `begin` of the environments `who` (n,), which are then in the arcs `arc` (n,).
+        """
+        event = self.vehicles.end[arc, who]
+        until = event - begin
+        thrust, flow = self.vehicles.thrust[arc, who], self.vehicles.flow[arc, who]
+        y = self._arc(y, u, np.minimum(duration, until), who, thrust, flow)
+        passed = np.flatnonzero(event <= end)
+        if len(passed):
+            # a duration is rounded: an event at the step's very end, which the next step takes as past, is not missed
+            passed = passed[(duration >= until - 1e-9)[passed]]
+            u, end, who, arc = u[:, passed], end[passed], who[passed], arc[passed]
+            y[6, passed] -= self.vehicles.dropped[arc, who]
+            late = np.maximum((duration - until)[passed], 0.0)
+            y[:, passed] = self._fly(y[:, passed], u, event[passed], end, late, who, arc + 1)
+        return y
+
+    def _arc(self, y, u, dt, who, thrust, flow):
+        """States (7, n) after dt (n,) seconds without an event: one RK4 step, several for a plunge into dense air.
+
+        There drag is stiff: its rate times the step, at the lowest altitude that the step can reach, is kept below
+        `STIFF`. No ascent comes near it; without this a crash at orbital speed would end in numbers without meaning.
+        """
+        rocket, controls = self.rocket, (*u, thrust, flow)
+        drag, wind = (self.vehicles.drag[who], self.vehicles.wind[:, who]) if self.dispersion else (None, None)
+        # the state as one component (7, n): rk4 then takes a seventh of the array operations
+        f = lambda x, u: (np.array(ascent(x[0], u, rocket, wind, drag)),)  # noqa: E731
+        speed = np.sqrt((y[3:6] ** 2).sum(axis=0))
+        lowest = np.maximum(np.sqrt((y[:3] ** 2).sum(axis=0)) - rocket.Re - speed * dt, 0.0)
+        rate = rocket.rho0 * np.exp(-lowest / rocket.H) * rocket.Cd * rocket.S * speed / y[6]
+        if self.dispersion:
+            rate = drag * rate
+        (y_next,) = rk4(f, (y,), controls, dt)
+        stiff = np.flatnonzero(rate * dt > STIFF)
+        if len(stiff):
+            n = np.ceil((rate * dt)[stiff] / STIFF)  # for each its own: it must not depend on the rest of the batch
+            y_sub, controls, dt = y[:, stiff], tuple(c[stiff] for c in controls), dt[stiff] / n
+            if self.dispersion:
+                drag, wind = drag[stiff], wind[:, stiff]
+            for k in range(int(n.max())):
+                aloft = (y_sub[:3] ** 2).sum(axis=0) >= rocket.Re**2  # who is below the ground stays there
+                y_sub = np.where(aloft & (k < n), rk4(f, (y_sub,), controls, dt)[0], y_sub)
+            y_next[:, stiff] = y_sub
+        return y_next
+
+    def _cut(self, before, u, begin, end, duration, who, arc):
+        """States (7, n) and times (n,) within the step at which `who` reach the target's energy; the rest as `_fly`'s.
+
+        Regula falsi with the Illinois change (Dowell and Jarratt, 1971). The energy grows almost linearly in a step, so
+        that four evaluations reach rounding; six, for all alike, keep a row independent of the rest of the batch.
+        """
+        goal = self.rocket.target_energy
+        low, high, above = np.zeros(len(who)), duration, np.full(len(who), -1)
+        f_low = np.minimum(specific_energy(before, self.rocket.mu) - goal, -1e-300)  # beyond it at the start: cut there
+        f_high = specific_energy(self.y[:, who], self.rocket.mu) - goal
+        for _ in range(6):
+            time = low - f_low * (high - low) / (f_high - f_low)
+            y = self._fly(before, u, begin, end, time, who, arc)
+            f, above_before = specific_energy(y, self.rocket.mu) - goal, above
+            above = f >= 0
+            kept = above == above_before  # the same end twice: its value is halved
+            f_low, f_high = np.where(above, f_low / (1 + kept), f), np.where(above, f, f_high / (1 + kept))
+            low, high = np.where(above, low, time), np.where(above, time, high)
+        return y, time
+
+    def _reward(self, before, u, phase, altitude, done):
+        """The five parts of this step, added to their sums; returns what is paid, (N,): their total, R_terminal with
+        `terminal_scale`."""
+        t = self.t
+        distance, energy = self._progress()
+        turn = np.sqrt(((u - self.u) ** 2).sum(axis=0)) * (t > 0)
+        burnt = (before[6] - self.y[6]) * (phase == self._last_phase)
+        parts = np.zeros_like(self._parts)
+        parts[0] = orbital_reward(self._distance, distance)
+        parts[1] = trajectory_reward(self._energy, energy, phase < self._last_phase, self.trajectory_weight)
+        if REFERENCE_PITCH[self.guidance] is not None:
+            until = self.mission.guided_until or self.rocket.burns[0].end
+            times, angles = REFERENCE_PITCH[self.guidance]
+            pitch = np.radians(np.interp(self.rocket.dt * t, until * np.array(times), angles, right=np.nan))
+            parts[2] = guidance_reward(u, *local_frame(before, self._axes[2])[:2], pitch, self.guidance_weight)
+        left = np.minimum(self.y[6] - self.vehicles.dry_mass, self.vehicles.propellant)
+        parts[3] = penalties(self.mission, altitude, self.time, turn, burnt, left, self.mass_weight)
+        self._parts += parts
+        if done.any():
+            error_norm = np.linalg.norm(terminal_error(self.y[:, done].T, self.rocket), axis=1)
+            self._parts[4, done] += terminal_reward(error_norm)
+            parts[4, done] = terminal_reward(error_norm, self.terminal_scale)
+        self._distance, self._energy = distance, energy
+        return parts.sum(axis=0)
+
+    def _final_info(self):
+        y = self.y.T
+        error, elements = terminal_error(y, self.rocket), orbital_elements(y, self.rocket.mu)
+        error_norm = np.sqrt((error * error).sum(axis=1))
+        info = {"error": error, "error_norm": error_norm, "a_km": elements.a / 1e3, "e": elements.e}
+        info |= {f"{name}_deg": np.degrees(getattr(elements, name)) for name in ("i", "raan", "argp")}
+        info |= {"final_mass_kg": self.y[6].copy(), "final_time_s": self.time.copy(), "crashed": self._crashed.copy()}
+        info |= {"max_altitude_km": self._max_altitude / 1e3, "points": precision_points(error_norm)}
+        if self.dispersion:
+            info |= {"draw": self.draw.copy(), "dry": self.time >= self.vehicles.burn_out - 1e-6}
+        return info | dict(zip(self.PARTS, self._parts.copy())) | {"episodic_return": self._parts.sum(axis=0)}
+
+    def _snapshot(self):
+        return self.time.copy(), self.u.T.copy(), self.y.T.copy()
+
+    def _make_sheet(self, animation):
+        return animation.Ascent(self.rocket)
+
+
+def reachable(rocket: Rocket, dispersion: float = 0.0) -> tuple[float, float]:
+    """Bounds of |r| (m) and |v| (m/s): the launcher's delta-v and gravity all pointing one way, the whole flight.
+
+    With dispersion the delta-v is bounded by one stage's with the fastest exhaust, the heaviest start and the lightest
+    end.
+    """
+    gain, end = delta_v(rocket), rocket.end_time
+    if dispersion:
+        draw = largest_draw(rocket, dispersion)
+        scores = dict(zip(draw_names(rocket), draw_bounds(rocket, dispersion)))
+        heavy, light = draw_vehicles(rocket, dispersion, draw), draw_vehicles(rocket, dispersion, -draw)
+        engines = [(e.thrust, e.flow(rocket.table_isp)) for burn in rocket.burns for _, e in burn.engines]
+        fastest = max((thrust / flow for thrust, flow in engines if flow), default=0.0)
+        gain = fastest * (1 + dispersion * DISPERSION.isp * scores["isp_1"])
+        gain *= np.log(heavy.mass[0] / light.dry_mass[0])
+        end = max(end, heavy.burn_out[0])
+    v_max = np.linalg.norm(rocket.x0[3:6]) + gain + rocket.mu / rocket.Re**2 * end
+    return rocket.Re + v_max * end, v_max
+
+
+class RocketEnv(SingleEnv):
+    """One `RocketVectorEnv`; its public attributes are the batch's."""
+
+    mass_weight = of_batch("mass_weight", "Reward lost per `mass_unit` of propellant burnt in the last phase.")
+    trajectory_weight = of_batch("trajectory_weight", "Weight of R_trajectory.")
+    guidance_weight = of_batch("guidance_weight", "Weight of R_guidance.")
+    guidance = of_batch("guidance", "The reference pitch of R_guidance, a key of REFERENCE_PITCH.")
+    end_time = of_batch("end_time", "Seconds after which an episode ends at the latest.")
+    terminal_scale = of_batch("terminal_scale", "The scale of R_terminal in the reward; reports keep TERMINAL_SCALE.")
+    draw = of_batch("draw", "The running episode's standard scores (1, k), zeros without dispersion.")
+
+
+def flown_mission(mission: Mission, rocket: Rocket | None = None, table_isp: bool = False) -> Mission:
+    """A mission as these options of the environment have it flown: by another rocket, with the table's Isp."""
+    rocket = rocket or mission.rocket
+    return replace(mission, rocket=replace(rocket, table_isp=table_isp or rocket.table_isp))
+
+
+def make_rocket_vector(env_id: str, num_envs: int = 1, rocket: Rocket | None = None, **options) -> RocketVectorEnv:
+    """The batched environment of a mission in `ROCKETS`, or of another rocket on it; `gymnasium.make_vec` calls it."""
+    return RocketVectorEnv(num_envs, flown_mission(ROCKETS[env_id], rocket), **options)
+
+
+def make_rocket(env_id: str, **options) -> RocketEnv:
+    """The single environment of a mission in `ROCKETS`; what `gymnasium.make` calls."""
+    return RocketEnv(make_rocket_vector(env_id, **options))
+
+
+def fly_rocket(env_id: str, policy: Callable, end_time: float | None = None, draw=None, **options) -> dict:
+    """Fly `policy(obs (1, obs), t) -> action (1, 3)` once, to `end_time` (s) at the latest, and record what happened.
+
+    draw (k,): the vehicle's standard scores, with the option `dispersion`.
+
+    Returns t (K+1,) s, u (K, 3) the unit directions in ECI, y (K+1, 7) r, v, m, reward (K,), and the last step's info.
+    """
+    env = gym.make_vec(env_id, num_envs=1, **options)
+    if end_time is not None:
+        env.end_time = end_time
+    obs, _ = env.reset(options=None if draw is None else {"draw": [draw]})
+    t, u, y, rewards, final = [0.0], [], [env.y[:, 0].copy()], [], {}
+    while not final:
+        obs, reward, _, final = env.advance(policy(obs, len(u)))
+        t.append(env.time[0])
+        u.append(env.u[:, 0])
+        y.append(env.y[:, 0].copy())
+        rewards.append(reward[0])
+    final = {key: value[0] for key, value in final.items()}
+    return {"t": np.array(t), "u": np.array(u), "y": np.array(y), "reward": np.array(rewards), **final}
