@@ -176,7 +176,7 @@ def test_evaluation_does_not_keep_the_optimum_of_a_replaced_rocket(monkeypatch):
 
 
 def test_a_bad_file_of_vehicles_is_left_out_with_a_line(tmp_path):
-    for name in ("envs.py", "rocket.py"):
+    for name in ("envs.py", "batched.py", "rocket_env.py", "rocket.py"):
         shutil.copy(ROOT / name, tmp_path)
     (tmp_path / "vehicles").mkdir()
     good = (ROOT / "vehicles" / "two_stage_leo.py").read_text()
