@@ -417,7 +417,7 @@ def engine_groups(rocket: Rocket) -> tuple[Group, ...]:
     """
     starts = [0.0, *(burn.end for burn in rocket.burns)]
     count = lambda parts, engine: sum(n for n, other in parts if other == engine)  # noqa: E731
-    groups, last = [], len(rocket.burns) - 1
+    groups, last, types = [], len(rocket.burns) - 1, engine_types(rocket)
     for k, burn in enumerate(rocket.burns):
         for number, engine in burn.engines if k == last else burn.dropped:
             lit = []
@@ -428,8 +428,7 @@ def engine_groups(rocket: Rocket) -> tuple[Group, ...]:
                 lit += [j] if burning else []
             flow, part = engine.flow(rocket.table_isp), sum(rocket.burns[j].end - starts[j] for j in lit)
             full = engine.propellant / flow if flow else np.inf
-            type_ = engine_types(rocket).index(engine)
-            groups.append(Group(number, engine, type_, k, tuple(lit), part, full))
+            groups.append(Group(number, engine, types.index(engine), k, tuple(lit), part, full))
     return tuple(groups)
 
 
@@ -458,7 +457,7 @@ def draw_vehicles(rocket: Rocket, dispersion: float, draw: np.ndarray) -> Vehicl
     that uses a part of its propellant. Raises BadInput for a draw that no vehicle can have.
     """
     (rate, isp, load, dry), payload, drag, wind = draw_values(rocket, dispersion, np.asarray(draw, dtype=np.float64))
-    of = engine_types(rocket).index
+    of = {engine: j for j, engine in enumerate(engine_types(rocket))}.get
     empty = lambda parts: sum(n * (e.total_mass - e.propellant) * dry[of(e)] for n, e in parts)  # noqa: E731
     full = lambda parts: sum(n * e.propellant * load[of(e)] for n, e in parts)  # noqa: E731
     last = rocket.burns[-1].engines
@@ -490,9 +489,9 @@ def burn_ends(rocket: Rocket, lasting: np.ndarray):
     start, lit = np.zeros(lasting.shape[1]), np.zeros((len(groups), lasting.shape[1]))
     ends = []
     for k, burn in enumerate(rocket.burns):
-        limit, due = np.full_like(start, np.inf), np.full_like(start, np.inf)
+        limit = due = np.full(len(start), np.inf)
         for group, spent in zip(groups, lit):
-            if k in group.lit and np.isfinite(group.full):
+            if k in group.lit and group.full < np.inf:
                 limit = np.minimum(limit, group.full * lasting[group.type] - spent)
                 if k == group.dropped:
                     due = np.minimum(due, group.part * lasting[group.type] - spent)
@@ -502,7 +501,8 @@ def burn_ends(rocket: Rocket, lasting: np.ndarray):
         burn_out, before = start + first, start
         start = ends[-1]
         for group, spent in zip(groups, lit):
-            spent += (start - before) * (k in group.lit)
+            if k in group.lit:
+                spent += start - before
     return np.array(ends), burn_out, lit
 
 
