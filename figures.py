@@ -409,9 +409,10 @@ def draw_target_plane(plane, insertion, lines: dict, rocket: envs.Rocket):
     left, right = max(a * (1 + rocket.e), Re / 1e3), max(a * (1 - rocket.e), Re / 1e3)
     margin, half = 0.06 * left, 1.1 * max(b, Re / 1e3)
     plane.set(xlim=(-left - margin, right + margin), ylim=(-half, half), aspect="equal")
-    plane.set(xlabel="towards the target's perigee (1000 km)", ylabel="along its semi-latus rectum (1000 km)")
+    first = "the target's perigee" if rocket.e else f"{rocket.argp:g}° from the target's node"  # a circle's axes
+    plane.set(xlabel=f"towards {first} (1000 km)", ylabel="a right angle ahead of it (1000 km)")
     plane.set_title("Plane of the target orbit")
-    insertion.set(xlabel="angle from the target's perigee (deg)", ylabel="altitude (km)")
+    insertion.set(xlabel=f"angle from {first} (deg)", ylabel="altitude (km)")
     insertion.set(xlim=(min(ends) - 2, max(ends) + 8), title="Ascent and insertion (circles)")
 
 
