@@ -246,9 +246,11 @@ class Ascent(Sheet):
         )
         low, high, side = -a * (1 + e), max(a * (1 - e), Re), max(a * np.sqrt(1 - e * e), Re)
         margin = 0.06 * (high - low)
-        self.orbit.set(xlim=(low - margin, high + margin), ylim=(-side - margin, side + margin), aspect="equal")
+        top = side + 3 * margin  # room for the caption: a title above a round orbit would meet the figure's
+        self.orbit.set(xlim=(low - margin, high + margin), ylim=(-side - margin, top), aspect="equal")
         self.orbit.set_axis_off()
-        self.orbit.set_title("orbit if the engines stopped now, and the target", fontsize=8)
+        caption = "orbit if the engines stopped now, and the target"
+        self.orbit.text((low + high) / 2, top, caption, ha="center", va="top", fontsize=8)
         self.orbit.text(0, -0.6 * Re, "Earth", ha="center", va="center", fontsize=7, color="0.4")
 
     def _target_state(self) -> tuple[np.ndarray, np.ndarray]:

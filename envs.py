@@ -28,62 +28,12 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.spaces import Box
 
-from batched import DRAWN, BatchedEnv, SingleEnv, of_batch, rk4, warn_of_no_mode  # noqa: F401 - as the next two
-from rocket import (  # noqa: F401 - every name of rocket.py is also one of envs.py
-    BOOSTER,
-    DISPERSION,
-    DRAW,
-    G0,
-    LARGEST_DISPERSION,
-    PAPER_MISSION,
-    REFERENCE_PITCH,
-    ROCKET,
-    ROCKETS,
-    STAGE_1,
-    STAGE_2,
-    TERMINAL_SCALE,
-    BadInput,
-    Burn,
-    Dispersion,
-    Engine,
-    Mission,
-    OrbitalElements,
-    Rocket,
-    Vehicles,
-    ascent,
-    delta_v,
-    draw_bounds,
-    draw_names,
-    draw_vehicles,
-    guidance_reward,
-    largest_draw,
-    launch_raan,
-    local_frame,
-    nominal_vehicles,
-    orbit_vectors,
-    orbital_elements,
-    orbital_reward,
-    penalties,
-    precision_points,
-    refuse_unless,
-    specific_energy,
-    target_axes,
-    target_orbit,
-    terminal_error,
-    terminal_reward,
-    trajectory_reward,
-)
-from rocket_env import (  # noqa: F401 - so is every name of rocket_env.py
-    ACTION_FRAMES,
-    STIFF,
-    RocketEnv,
-    RocketVectorEnv,
-    flown_mission,
-    fly_rocket,
-    make_rocket,
-    make_rocket_vector,
-    reachable,
-)
+from batched import *  # noqa: F403 - every name of these three is also one of envs.py
+from batched import DRAWN, BatchedEnv, SingleEnv, of_batch, rk4
+from rocket import *  # noqa: F403
+from rocket import PAPER_MISSION, ROCKETS, BadInput, Mission, Rocket
+from rocket_env import *  # noqa: F403
+from rocket_env import make_rocket
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Dynamics: x is a tuple of components, each a NumPy array over environments or a CasADi symbol

@@ -3,8 +3,8 @@
 Reading order: the tables (`Engine`, `Burn`, `Rocket`; `ROCKET` is the paper's), what cannot fly, the missions, what
 differs from flight to flight (`Dispersion`), the equations of motion (`ascent`), the geometry of orbits, the five parts
 of the reward. Functions of a state without memory; nothing is imported but NumPy, and `ascent`, `orbit_vectors` and
-`specific_energy` take CasADi symbols, too. `RocketVectorEnv` in `envs.py` flies them: time grid, events, RK4, cutoff.
-Every name here is also one of `envs`.
+`specific_energy` take CasADi symbols, too. `rocket_env.py` flies them: time grid, events, RK4, cut-off. Every name here
+is also one of `envs`.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Engine:
     total_mass: float  # kg
     propellant: float  # kg
     thrust: float  # N
-    isp: float  # s, the table's, which its propellant, thrust and burn time contradict (stage 2: 467.2 s)
+    isp: float  # s, the table's, flown with table_isp alone: the other four contradict it
     burn_time: float  # s
 
     def __post_init__(self):

@@ -74,7 +74,7 @@ class RocketVectorEnv(BatchedEnv):
     Reward: the sum of the five parts R_orbital, R_trajectory, R_guidance, R_penalties and R_terminal, each a function
     of `rocket.py`. `final_info`, (N,) each: `error_norm` (and `error` (N, 6), the terminal error in ECI), `a_km e i_deg
     raan_deg argp_deg final_mass_kg final_time_s max_altitude_km` (at the steps' ends), the parts' sums,
-    `episodic_return`, `points` (`precision_points`), `crashed`, with dispersion `draw` (N, k).
+    `episodic_return`, `points` (`precision_points`), `crashed`; with dispersion `draw` (N, k) and `dry`, out of fuel.
 
     Attributes that only training changes, to be set before a `reset`: `mass_weight`, `trajectory_weight`,
     `guidance_weight`, `guidance` (a key of `REFERENCE_PITCH`), `end_time` (s, at most the last phase's end) and

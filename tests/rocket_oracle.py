@@ -40,6 +40,23 @@ def energy(s):
     return (s[3] ** 2 + s[4] ** 2 + s[5] ** 2) / 2 - MU / math.sqrt(s[0] ** 2 + s[1] ** 2 + s[2] ** 2)
 
 
+def between_events(rows, derivative, s, begin, end, before=(), after=(), events=None):
+    """State at `end`, by DOP853 through rows (start, end, thrust, flow, kg dropped); (time, state) at a first event.
+
+    derivative(t, s, *before, thrust, flow, *after).
+    """
+    for start, stop, thrust, flow, dropped in rows:
+        a, b = max(begin, start), min(end, stop)
+        if a < b:
+            options = {"rtol": 1e-11, "atol": ATOL, "first_step": b - a, "args": (*before, thrust, flow, *after)}
+            solution = solve_ivp(derivative, (a, b), s, "DOP853", events=events, **options)
+            if events and len(solution.t_events[0]):
+                return solution.t_events[0][0], solution.y_events[0][0]
+            s = solution.y[:, -1].copy()
+            s[6] -= dropped if stop <= end else 0
+    return s
+
+
 class Vehicle:
     """A rocket's numbers and what follows from them. `engines`: name -> (total kg, propellant kg, N, Isp s, burn s);
     `burns`: rows of end (s), engines that burn and engines dropped then, both as {name: number}."""
@@ -117,16 +134,7 @@ class Vehicle:
 
     def integrate(self, s, begin, end, u, table_isp=False, events=None):
         """State at `end`, by DOP853 between the vehicle's events; with `events` (time, state) at the first of them."""
-        for start, stop, thrust, flow, dropped in self.stretches(table_isp):
-            a, b = max(begin, start), min(end, stop)
-            if a < b:
-                options = {"rtol": 1e-11, "atol": ATOL, "first_step": b - a, "args": (u, thrust, flow)}
-                solution = solve_ivp(self.derivative, (a, b), s, "DOP853", events=events, **options)
-                if events and len(solution.t_events[0]):
-                    return solution.t_events[0][0], solution.y_events[0][0]
-                s = solution.y[:, -1].copy()
-                s[6] -= dropped if stop <= end else 0
-        return s
+        return between_events(self.stretches(table_isp), self.derivative, s, begin, end, (u,), events=events)
 
     def up_along_cross(self, s):
         up = unit([float(component) for component in s[:3]])

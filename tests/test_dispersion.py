@@ -11,20 +11,19 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
-from scipy.integrate import solve_ivp
+from rocket_oracle import CUTOFF, FIXED, LEO, MU, OMEGA, RE, between_events, energy
 
 import envs
 from envs import DRAW, ROCKET, ROCKETS, BadInput, ascent, fly_rocket
 from rocket import engine_groups
 
-FIXED, CUTOFF, LEO = IDS = ["RocketAscent-v0", "RocketAscentCutoff-v0", "TwoStageLEO-v0"]
+IDS = [FIXED, CUTOFF, LEO]
 LEO_DRAW = ["burn_rate_1", "burn_rate_2", "isp_1", "isp_2", "propellant_1", "propellant_2", "dry_mass_1", "dry_mass_2"]
 LEO_DRAW += ["payload", "drag", "wind_east", "wind_north"]
 
 # --- a drawn vehicle, typed once more ---------------------------------------------------------------------------------
 
 SIGMAS = {"burn_rate": 0.005, "isp": 0.003, "propellant": 0.003, "dry_mass": 0.005, "drag": 0.14}
-MU, RE, OMEGA = 3.986012e14, 6378145.0, 7.29211585e-5
 # total mass, propellant, thrust, nominal burn time of the types, in order of ignition
 PAPER = [(19290, 17010, 628500, 75.2), (104380, 95550, 1083100, 261.0), (19300, 16820, 110094, 700.0)]
 TWO = [(433e3, 411e3, 7.6e6, 162.0), (111.5e3, 107.5e3, 934e3, 393.0)]
@@ -71,25 +70,12 @@ def derivative(t, s, u, thrust, flow, drag, wind, area):
     return [vx, vy, vz, *(-MU / r**3 * np.array([x, y, z]) + (thrust * np.array(u) + pull) / m), -flow]
 
 
-def energy(s):
-    return (s[3] ** 2 + s[4] ** 2 + s[5] ** 2) / 2 - MU / math.sqrt(s[0] ** 2 + s[1] ** 2 + s[2] ** 2)
-
-
 def integrate(env_id, z, s, begin, end, u, goal=None):
     """State at `end`, by DOP853 between the drawn events; with a goal (time, state) where the energy reaches it."""
     _, rows, *air = typed(env_id, z)
     reached = [lambda t, s, *_: (energy(s) - goal) / 1e6] if goal else None
-    for start, stop, thrust, flow, dropped in rows:
-        a, b = max(begin, start), min(end, stop)
-        if a < b:
-            args = (u, thrust, flow, *air, 10.5 if env_id == LEO else 4 * math.pi)
-            tolerances = {"rtol": 1e-11, "atol": [1e-5] * 3 + [1e-8] * 4, "first_step": b - a}
-            solution = solve_ivp(derivative, (a, b), s, "DOP853", args=args, events=reached, **tolerances)
-            if goal and len(solution.t_events[0]):
-                return solution.t_events[0][0], solution.y_events[0][0]
-            s = solution.y[:, -1].copy()
-            s[6] -= dropped if stop <= end else 0
-    return s
+    area = 10.5 if env_id == LEO else 4 * math.pi
+    return between_events(rows, derivative, s, begin, end, (u,), (*air, area), reached)
 
 
 def direction(env_id, t):
