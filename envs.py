@@ -161,7 +161,8 @@ class PhasedVectorEnv(BatchedEnv):
     `final_info`: `episodic_return` (with the true radii), `cost`, `cost_state`, `cost_control`, `cost_terminal`, each
     (N,), and `hit` and `terminal_error` (the distance to the target at each phase's end), each (N, phases).
 
-    `observe_phase=False` shows tau and phi as 0. `reset(options={"x0": (N, 2)})` sets the starts.
+    `observe_phase=False` shows tau and phi as 0, `observe_velocity=False` x2. `reset(options={"x0": (N, 2)})` sets the
+    starts.
 
     Attributes that only training changes, to be set before a `reset`: `radius_scale`, a scalar or one number a phase,
     enlarges the radii in which the *reward* pays the bonus (1 is the paper); with `flights_per_start` G environment k
@@ -171,8 +172,15 @@ class PhasedVectorEnv(BatchedEnv):
 
     metadata = {**BatchedEnv.metadata, **DRAWN}
 
-    def __init__(self, problem: Problem, num_envs: int = 1, observe_phase: bool = True, render_mode: str | None = None):
-        self.problem, self.observe_phase = problem, observe_phase
+    def __init__(
+        self,
+        problem: Problem,
+        num_envs: int = 1,
+        observe_phase: bool = True,
+        observe_velocity: bool = True,
+        render_mode: str | None = None,
+    ):
+        self.problem, self.observe_phase, self.observe_velocity = problem, observe_phase, observe_velocity
         self.radius_scale, self.flights_per_start = 1.0, 1
         multi_phase = len(problem.phases) > 1
         target_max = np.max([np.abs(phase.target) for phase in problem.phases], axis=0)
@@ -225,7 +233,8 @@ class PhasedVectorEnv(BatchedEnv):
         self._terminal_cost[mask] = self._bonus[mask] = self._terminal_error[mask] = 0.0
 
     def _observe(self):
-        return np.column_stack([*self.x, self._context[self.t]])
+        position, velocity = self.x
+        return np.column_stack([position, velocity * self.observe_velocity, self._context[self.t]])
 
     def _advance(self, actions):
         t = self.t
@@ -295,13 +304,12 @@ def fly(env_id: str, policy: Callable, x0, **options) -> dict:
     problem = PROBLEMS[env_id]
     x = np.empty((len(x0), problem.steps + 1, 2))
     u, reward = np.empty((2, len(x0), problem.steps))
-    obs, info = envs.reset(options={"x0": x0})
+    obs, _ = envs.reset(options={"x0": x0})
     for t in range(problem.steps):
-        action = np.asarray(policy(obs, t), dtype=np.float64)
-        x[:, t], u[:, t] = obs[:, :2], np.clip(action[:, 0], -problem.u_max, problem.u_max)
-        obs, reward[:, t], _, _, info = envs.step(action)
-    x[:, -1] = info["final_obs"][:, :2]
-    final = {key: value for key, value in info["final_info"].items() if not key.startswith("_")}
+        x[:, t] = np.column_stack(envs.x)  # not of obs: the velocity may be hidden there
+        obs, reward[:, t], _, final = envs.advance(policy(obs, t))
+        u[:, t] = envs.u
+    x[:, -1] = np.column_stack(envs.x)
     return {"x": x, "u": u, "reward": reward, **final}
 
 

@@ -61,7 +61,7 @@ class Args:
     reward_scale: float = 0.2  # factor on the rewards in training; everything logged is unscaled
 
     # transformer (a laptop's; README has Table 1's beside ours)
-    num_blocks: int = 2  # number of GTrXL blocks
+    num_blocks: int = 2  # number of GTrXL blocks (0: a plain MLP, without memory)
     embed_dim: int = 64  # embedding dimension d
     num_heads: int = 4  # number of attention heads
     memory_length: int = 32  # memory length L: a step attends to itself and the L steps before it
@@ -172,7 +172,11 @@ def describe(episodes, metrics):
     if not metrics:
         return line
     orbit = f"a {metrics['a_km']:.1f} km  e {metrics['e']:.4f}  i {metrics['i_deg']:.2f}"
-    return f"{line}  mean action: error {metrics['error_norm']:.5f}  {orbit}  mass {metrics['final_mass_kg']:.1f} kg"
+    line = f"{line}  mean action: error {metrics['error_norm']:.5f}  {orbit}  mass {metrics['final_mass_kg']:.1f} kg"
+    if "dispersion" not in metrics:
+        return line
+    errors = f"median {metrics['dispersed_error_median']:.5f}  p95 {metrics['dispersed_error_p95']:.5f}"
+    return f"{line}  dispersed: {errors}"
 
 
 # Shared: Gated Transformer-XL ("Gated Transformer-XL Implementation") -------------------------------------------------

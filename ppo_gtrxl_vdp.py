@@ -51,11 +51,12 @@ class Args:
     # environment
     env_id: str = "VanDerPol-v0"  # the id of the environment, one of ENV_IDS
     observe_phase: bool = True  # show time and phase to the policy
+    observe_velocity: bool = True  # show the velocity to the policy
     radius_curriculum: float = 6.0  # waypoints: training radius at first, in target radii (1: none, as in the paper)
     reward_scale: float = 0.1  # factor on the rewards in training; everything logged is unscaled
 
     # transformer (Table 1)
-    num_blocks: int = 3  # number of GTrXL blocks
+    num_blocks: int = 3  # number of GTrXL blocks (0: a plain MLP, without memory)
     embed_dim: int = 128  # embedding dimension d
     num_heads: int = 2  # number of attention heads
     memory_length: int = 32  # memory length L: a step attends to itself and the L steps before it
@@ -92,7 +93,7 @@ class Args:
 
 # Problem: what differs from the other scripts -------------------------------------------------------------------------
 ENV_IDS = ("VanDerPol-v0", "VanDerPolWaypoints-v0")
-ENV_OPTIONS = ("observe_phase",)  # arguments of the environments
+ENV_OPTIONS = ("observe_phase", "observe_velocity")  # arguments of the environments
 SIZES = dict(zip(ENV_IDS, (3, 6)))  # of an observation
 BUFFERS = {env_id: {"observation_scale": [1.0] * n} for env_id, n in SIZES.items()}  # `features` reads agent.<name>
 INITIAL_ACTION = [0.0]  # the mean before training

@@ -47,7 +47,7 @@ RANGES = {  # lowest and highest value of every numeric flag; NaN and infinity a
     **dict.fromkeys(["ent_coef", "ent_coef_final", "vf_coef", "mass_weight"], (0.0, 1e3)),
     **dict.fromkeys(["reward_scale", "max_grad_norm", "target_kl"], (1e-9, 1e9)),
     **dict.fromkeys(["log_std", "log_std_refine", "log_std_final"], (-8.0, 0.5)),
-    **{"eval_starts": (10, 10**6), "num_blocks": (1, 64), "memory_length": (0, 8192)},
+    **{"eval_starts": (10, 10**6), "num_blocks": (0, 64), "memory_length": (0, 8192)},
     **{"flights_per_start": (1, 10**6), "dispersion": (0.0, 10.0)},
 }
 CHOICES = {"action_frame": ("local", "eci"), "guidance": ("none", "linear", "knots")}

@@ -245,6 +245,20 @@ def test_hidden_phase_reads_zero(env_id):
 
 
 @pytest.mark.parametrize("env_id", PROBLEMS)
+def test_hidden_velocity_reads_zero_and_flies_on(env_id):
+    """What is hidden is hidden from the policy alone: flights record the true velocity and cost the same."""
+    (shown, _), (hidden, _) = observations(env_id), observations(env_id, observe_velocity=False)
+    assert shown[1:, 1].any() and not hidden[:, 1].any()
+    np.testing.assert_array_equal(np.delete(hidden, 1, axis=1), np.delete(shown, 1, axis=1))
+    x0 = np.array([[0.4, -0.7], [-1.0, 0.3]])
+    push = lambda obs, t: np.full((2, 1), math.sin(t))  # noqa: E731
+    open_eyes, blind = fly(env_id, push, x0), fly(env_id, push, x0, observe_velocity=False)
+    assert open_eyes.keys() == blind.keys() and blind["x"][:, :, 1].any(axis=1).all()
+    for key in open_eyes:
+        np.testing.assert_array_equal(open_eyes[key], blind[key])
+
+
+@pytest.mark.parametrize("env_id", PROBLEMS)
 def test_observation_space_contains_what_the_worst_controls_reach(env_id):
     u_max, envs = TABLES[env_id][0], gym.make_vec(env_id, num_envs=4)
     space = envs.single_observation_space

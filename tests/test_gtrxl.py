@@ -50,7 +50,7 @@ def array(tensor):
 
 
 @pytest.mark.parametrize("dtype", TOLERANCE, ids=str)
-@pytest.mark.parametrize("num_blocks", [1, 3])
+@pytest.mark.parametrize("num_blocks", [0, 1, 3])
 @pytest.mark.parametrize("T, L", [(3, 8), (8, 8), (1, 4), (80, 8), (80, 20), (133, 20), (150, 160), (5, 0), (80, 0)])
 def test_cache_and_parallel_pass_agree(dtype, num_blocks, T, L):
     """T shorter than, equal to and longer than L, and not a multiple of the chunk (of at most max(L / 2, 64) steps)."""

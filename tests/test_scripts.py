@@ -184,7 +184,12 @@ TABLE_1 = {
 # INTERFACE and DECISIONS: what the paper does not give
 OURS = {"num_envs": (80, 117), "radius_curriculum": (12, 6), "memory_noise": (0.1, 0.1)}
 OURS |= {"reward_scale": (0.1, 0.1), "max_grad_norm": (0.5, 0.5), "env_id": ("DoubleIntegrator-v0", "VanDerPol-v0")}
-OURS |= {"save_model": (True, True), "observe_phase": (True, True), "norm_adv": (True, True)}
+OURS |= {
+    "save_model": (True, True),
+    "observe_phase": (True, True),
+    "observe_velocity": (True, True),
+    "norm_adv": (True, True),
+}
 
 
 @pytest.mark.parametrize("name", TABLE_1 | OURS)
@@ -201,12 +206,13 @@ def test_flags_of_the_interface():
     words += (
         " num_threads torch_compile noise log_std_final gae_lambda_final lr_schedule memory_noise flights_per_start"
     )
-    words += " refine_from log_std_refine"
+    words += " refine_from log_std_refine observe_velocity"
     fields = {script: {field.name for field in dataclasses.fields(script.Args)} for script in MODULES}
-    assert all(set(words.split()) <= fields[script] | {"radius_curriculum"} for script in fields)
+    family_only = {"radius_curriculum", "observe_velocity"}
+    assert all(set(words.split()) <= fields[script] | family_only for script in fields)
     assert not {"return_norm", "noise_decay", "target_kl_final"} & fields[DI]
     rocket_only = {"action_frame", "guidance", "mass_weight", "dispersion", "observe_draw", "observe_mass"}
-    assert fields[DI] == fields[VDP] == fields[ROCKET] - rocket_only | {"radius_curriculum"}
+    assert fields[DI] == fields[VDP] == fields[ROCKET] - rocket_only | family_only
 
 
 # --- a run's files ----------------------------------------------------------------------------------------------------
@@ -406,7 +412,7 @@ def test_eval_only_defaults(trained, tmp_path, monkeypatch):
     monkeypatch.setattr(runs.evaluate, "evaluate", evaluate)
     monkeypatch.setattr(runs.evaluate, "table", lambda metrics: "")
     DI.main(["--eval-only", f"--checkpoint={trained / 'agent.safetensors'}", "--embed-dim=8", "--eval-seed=7"])
-    assert asked == [("DoubleIntegrator-v0", 7, 1000, {"observe_phase": False})]
+    assert asked == [("DoubleIntegrator-v0", 7, 1000, {"observe_phase": False, "observe_velocity": True})]
     assert os.listdir() == []
 
 
@@ -862,7 +868,7 @@ def flag(name):
 
 
 NUMBERS = [f for f in dataclasses.fields(DI.Args) if re.search(r"\b(int|float)\b", str(f.type))]
-POSITIVE = "total_updates num_envs num_minibatches update_epochs num_blocks embed_dim num_heads mlp_dim hidden_dim"
+POSITIVE = "total_updates num_envs num_minibatches update_epochs embed_dim num_heads mlp_dim hidden_dim"
 POSITIVE += " eval_starts reward_scale max_grad_norm target_kl radius_curriculum flights_per_start"
 
 

@@ -1,0 +1,153 @@
+"""What the attention heads look at: the weights over the window, head by head, along one flight of a trained policy.
+
+    python benchmarks/attention.py results/rocket_dispersed results/memory/attention_rocket.png
+    python benchmarks/attention.py results/vdp_waypoints results/memory/attention_waypoints.png
+
+Flies the mean action once (a rocket trained on dispersions: the first draw of `--eval-seed`, else the first start),
+draws a panel for each head, and prints how far back each looks: the mean distance under its weights, over the whole
+flight, in the 20 s after each staging (or the 1 s after each waypoint), and what uniform weights would give.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+from pathlib import Path
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+import envs  # noqa: E402
+import evaluate  # noqa: E402
+import runs  # noqa: E402
+
+SCRIPTS = [importlib.import_module(path.stem) for path in sorted(ROOT.glob("ppo_gtrxl_*.py"))]
+
+
+def load(checkpoint):
+    """The agent of an agent.safetensors, its script's arguments, and the options of its environments."""
+    env_id = evaluate.read_checkpoint(checkpoint, {})["args"]["env_id"]
+    (script,) = (script for script in SCRIPTS if env_id in script.ENV_IDS)
+    argv = ["--eval-only", "--checkpoint", str(checkpoint)]
+    args, saved = runs.parse_args(script.Args, argv, script.ENV_OPTIONS, script.BUFFERS)
+    args.dispersion = saved["args"].get("dispersion", 0.0)
+    options = {name: getattr(args, name) for name in script.ENV_OPTIONS}
+    agent = script.Agent(args, envs.gym.make_vec(env_id, num_envs=1, **options))
+    runs.load_checkpoint(agent, args, saved)
+    return agent, args, options
+
+
+def observations(agent, args, options, eval_seed):
+    """One flight of the mean action: what was observed (T, obs) and when (T,) s."""
+    environment = envs.gym.make_vec(args.env_id, num_envs=1, **options)
+    rocket = args.env_id in envs.ROCKETS
+    if rocket:
+        start = {"draw": evaluate.draws(environment.rocket, args.dispersion, eval_seed, 1)} if args.dispersion else {}
+    else:
+        start = {"x0": evaluate.starts(eval_seed, 1)}
+    obs, _ = environment.reset(options=start)
+    policy, seen, ended = agent.make_policy(environment.episode_steps), [], np.array([False])
+    while not ended.all():
+        seen.append(obs[0])
+        obs, _, ended, _ = environment.advance(policy(obs, len(seen) - 1))
+    dt = environment.rocket.dt if rocket else environment.problem.dt
+    return np.array(seen), dt * np.arange(len(seen))
+
+
+@torch.no_grad()
+def weights(agent, obs):
+    """The attention weights (blocks, H, T, L + 1) of a flight's steps, by distance: 0 is the step itself.
+
+    A_ij = (x_i W^Q) (x_j W^K + R_{i-j})^T / sqrt(d_k) and its softmax over j = i - L .. i, written out once more. What
+    lies before the start is the evaluation's memory of zeros; its weight counts.
+    """
+    inputs, L, T = [], agent.memory_length, len(obs)
+    hooks = [block.attention.register_forward_pre_hook(lambda _, given: inputs.append(given)) for block in agent.blocks]
+    agent.encode(torch.as_tensor(obs, dtype=agent.actor_logstd.dtype)[None], agent.new_memory(1, noise=0.0))
+    for hook in hooks:
+        hook.remove()
+    found = []
+    for block, (x, memory) in zip(agent.blocks, inputs):
+        attention = block.attention
+        q = attention.query(x[0]).unflatten(-1, (attention.num_heads, attention.dk))  # (T, H, dk)
+        k = attention.key(torch.cat([memory[0], x[0]])).unflatten(-1, (attention.num_heads, attention.dk))
+        window = torch.stack([k[L - back : L - back + T] for back in range(L + 1)], dim=2)  # (T, H, L + 1, dk)
+        scores = torch.einsum("thd,thld->htl", q, window + attention.R) / attention.dk**0.5
+        found.append(scores.softmax(dim=-1))
+    return torch.stack(found).numpy()
+
+
+def changes(env_id, obs, t):
+    """When a new phase begins on a flight, s."""
+    if env_id in envs.ROCKETS:
+        return t[1:][np.diff(obs[:, 8]) > 0]
+    problem = envs.PROBLEMS[env_id]
+    return problem.dt * np.cumsum([phase.steps for phase in problem.phases])[:-1]
+
+
+def draw(found, t, events, title):
+    """A panel for each block and head: how far back (s) over the time of the flight (s), the weight as colour."""
+    blocks, heads, _, window = found.shape
+    dt = t[1] - t[0]
+    figure = Figure(figsize=(3.2 * heads, 2.6 * blocks + 0.8), layout="constrained")
+    panels = figure.subplots(blocks, heads, sharex=True, sharey=True, squeeze=False)
+    for b, row in enumerate(panels):
+        for h, ax in enumerate(row):
+            shown = np.sqrt(found[b, h].T)  # a root, so that small weights are seen
+            image = ax.pcolormesh(t, dt * np.arange(window), shown, vmin=0, vmax=1, cmap="magma", shading="nearest")
+            for event in events:
+                ax.axvline(event, color="tab:cyan", linewidth=0.8)
+            ax.set_title(f"block {b + 1}, head {h + 1}", fontsize=9)
+    for ax in panels[-1]:
+        ax.set_xlabel("time of flight (s)")
+    for ax in panels[:, 0]:
+        ax.set_ylabel("looks back (s)")
+    figure.colorbar(image, ax=panels, label="square root of the weight", shrink=0.8)
+    figure.suptitle(title)
+    return figure
+
+
+def lines(found, t, events):
+    """The printed table: each head's mean distance (s) under its weights, of all steps and of those after an event."""
+    dt, window = t[1] - t[0], found.shape[-1]
+    after = np.zeros(len(t), dtype=bool)
+    for event in events:
+        after |= (t >= event) & (t < event + 10 * dt)
+    back = dt * found @ np.arange(window)  # (blocks, H, T)
+    rows = [f"mean distance looked back, s (uniform weights: {dt * (window - 1) / 2:.2f})"]
+    for b, h in np.ndindex(found.shape[:2]):
+        late = f", in the {10 * dt:g} s after an event {back[b, h, after].mean():.2f}" if after.any() else ""
+        own = found[b, h, :, 0].mean()
+        rows.append(
+            f"  block {b + 1}, head {h + 1}: {back[b, h].mean():.2f}{late}; weight on the step itself {own:.2f}"
+        )
+    return rows
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", type=Path, help="results/<name> or runs/...")
+    parser.add_argument("figure", type=Path, help="the .png to write")
+    parser.add_argument("--eval-seed", type=int, default=0)
+    options = parser.parse_args()
+    try:
+        agent, args, env_options = load(options.folder / "agent.safetensors")
+        if not args.num_blocks:
+            raise ValueError(f"{options.folder}: num_blocks is 0; a plain MLP has no attention")
+        obs, t = observations(agent, args, env_options, options.eval_seed)
+        found = weights(agent, obs)
+        events = changes(args.env_id, obs, t)
+        print("\n".join(lines(found, t, events)))
+        draw(found, t, events, f"{args.env_id}: attention along one flight (lines: a new phase)").savefig(
+            options.figure
+        )
+    except (OSError, ValueError) as error:
+        sys.exit(f"error: {error}")
+
+
+if __name__ == "__main__":
+    main()
