@@ -670,11 +670,12 @@ def dispersed_lines(metrics: dict) -> list[str]:
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def publish(run_dir, folder, ship: bool = False):
+def publish(run_dir, folder, ship: bool = False, numbers: bool = False):
     """Add a run to a results folder: its eval.json and training curve under seeds/, and the policy if it is shipped.
 
-    The policy, its evaluation and the figures are replaced only where the folder ships none or with `ship`. OSError or
-    ValueError says what is missing or does not fit; nothing has been written then.
+    The policy, its evaluation and the figures are replaced only where the folder ships none or with `ship`; with
+    `numbers` the folder holds seeds/ alone. OSError or ValueError says what is missing or does not fit; nothing has
+    been written then.
     """
     run_dir, folder = Path(run_dir), Path(folder)
     metrics, _ = read_evaluation(run_dir)
@@ -692,7 +693,7 @@ def publish(run_dir, folder, ship: bool = False):
     (folder / "seeds").mkdir(parents=True, exist_ok=True)
     write_csv(folder / "seeds" / f"{metrics['seed']}.csv", curve)
     write_bytes(folder / "seeds" / f"{metrics['seed']}.json", (run_dir / "eval.json").read_bytes())
-    if ship or not shipped:
+    if (ship or not shipped) and not numbers:
         for name in ("agent.safetensors", "eval.npz", "eval.json"):
             write_bytes(folder / name, (run_dir / name).read_bytes())
         redraw(folder)

@@ -151,11 +151,15 @@ def mean_action(output, action_scale):
 def set_curriculum(envs, args, progress, refines, std):
     """What only training changes, all of it ours; returns how many flights in a row have the same start: any number.
 
-    Noise std scatters the ends of the flights by about std / 10: R_terminal need not be steeper. Precision comes first,
-    so that burning costs nothing in the first quarter of the updates, and --mass-weight from 60 % on.
+    Noise std scatters the ends of the flights by about std / 10: R_terminal need not be steeper; dispersed ones end
+    some 0.001 apart whatever the noise. What differs between them is hidden by the noise for most of a run: once the
+    orbit is nearly reached, they differ by up to four times as much, by less as the noise falls, so that they teach the
+    policy to steer against it. Precision comes first, so that burning costs nothing in the first quarter of the
+    updates, and --mass-weight from 60 % on.
     """
     envs.guidance = args.guidance
-    envs.terminal_scale = min(TERMINAL_SCALE, std / 8)
+    envs.terminal_scale = min(TERMINAL_SCALE, max(std / 8, 0.001 if args.dispersion else 0.0))
+    envs.draw_scale = np.clip(std / 0.016, 1.0, 4.0) if progress > 0.15 else 1.0
     ramp = np.clip((progress - 0.25) / (0.60 - 0.25), 0.0, 1.0)
     envs.mass_weight = float(envs.cutoff * args.mass_weight * ramp)
     return args.flights_per_start

@@ -1,11 +1,13 @@
 """Train a list of runs, some at a time; what is finished is skipped, what was cut goes on, and all is published.
 
-    python benchmarks/run_seeds.py jobs.txt [--at-once 2]
+    python benchmarks/run_seeds.py jobs.txt [--at-once 2] [--numbers]
 
 Each line of jobs.txt is a results folder and the command that trains for it; empty lines and # comments are skipped:
 
     results/rocket_fixed  ppo_gtrxl_rocket.py --seed 1 --num-threads 1
     results/rocket_fixed  ppo_gtrxl_rocket.py --seed 2 --num-threads 1
+
+With --numbers the results folders get the evaluations and curves alone: no weights, no figures.
 
 A run in runs/ belongs to a line if it has the same arguments, so nothing else is kept: start it again after a power
 cut and it does the rest. Each run's output is added to runs/<its name>.log. Exit status 1 if a run failed.
@@ -58,11 +60,11 @@ class Job:
         with open(f"runs/{self.results.name}_seed_{self.args['seed']}.log", "a") as log:
             return subprocess.Popen([sys.executable, ROOT / script, *flags], stdout=log, stderr=subprocess.STDOUT)
 
-    def publish(self):
-        """Add the run to its results folder, unless it is there already."""
+    def publish(self, numbers):
+        """Add the run, or its numbers alone, to its results folder, unless it is there already."""
         run, published = self.run_dir(), self.results / "seeds" / f"{self.args['seed']}.json"
         if not published.exists() or published.read_bytes() != (run / "eval.json").read_bytes():
-            evaluate.publish(run, self.results)
+            evaluate.publish(run, self.results, numbers=numbers)
 
 
 def read_jobs(path):
@@ -80,12 +82,12 @@ def read_jobs(path):
     return jobs
 
 
-def work(jobs, at_once):
+def work(jobs, at_once, numbers):
     """Train the jobs, `at_once` at a time, and publish each as it ends; returns those that failed."""
     waiting, running, failed = [job for job in jobs if not job.is_trained()], [], []
     print(f"{len(jobs)} jobs, {len(jobs) - len(waiting)} trained already", flush=True)
     for job in jobs:
-        job.publish() if job not in waiting else None
+        job.publish(numbers) if job not in waiting else None
     try:
         while waiting or running:
             while waiting and len(running) < at_once:
@@ -96,7 +98,7 @@ def work(jobs, at_once):
             for job, process in [pair for pair in running if pair[1].poll() is not None]:
                 running.remove((job, process))
                 print(f"ended with {process.returncode}: {shlex.join(job.command)}", flush=True)
-                job.publish() if process.returncode == 0 else failed.append(job)
+                job.publish(numbers) if process.returncode == 0 else failed.append(job)
     finally:
         for _, process in running:
             process.terminate()  # saves its state
@@ -109,9 +111,10 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("jobs", help="file with one run a line")
     parser.add_argument("--at-once", type=int, default=1, help="number of runs at a time")
+    parser.add_argument("--numbers", action="store_true", help="publish evaluations and curves, no policies")
     options = parser.parse_args()
     try:
-        sys.exit(1 if work(read_jobs(options.jobs), max(1, options.at_once)) else 0)
+        sys.exit(1 if work(read_jobs(options.jobs), max(1, options.at_once), options.numbers) else 0)
     except (OSError, ValueError) as error:
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:

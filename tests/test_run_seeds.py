@@ -16,7 +16,7 @@ TINY += " --num-minibatches 2 --update-epochs 2 --eval-starts 10 --num-threads 1
 
 def start(folder, lines):
     (folder / "jobs.txt").write_text("\n".join(lines))
-    command = [sys.executable, ROOT / "benchmarks" / "run_seeds.py", "jobs.txt", "--at-once", "2"]
+    command = [sys.executable, ROOT / "benchmarks" / "run_seeds.py", "jobs.txt", "--at-once", "2", "--numbers"]
     return subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
@@ -34,6 +34,9 @@ def test_run_seeds_survives_a_restart(tmp_path):
     assert second.returncode == 0, errors
     assert "2 jobs, 0 trained already" in output and output.count("ended with 0") == 2
     assert len(list(tmp_path.glob("runs/*/"))) == 2  # resumed, not begun anew
+    assert {path.name for path in tmp_path.glob("results/tiny/*")} == {
+        "seeds"
+    }  # --numbers: neither weights nor figures
     seeds = {path.stem: json.loads(path.read_text()) for path in (tmp_path / "results/tiny/seeds").glob("*.json")}
     assert {name: metrics["total_updates"] for name, metrics in seeds.items()} == {"1": 150, "2": 150}
     before = {path: path.stat().st_mtime_ns for path in tmp_path.glob("results/**/*")}

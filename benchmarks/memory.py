@@ -1,0 +1,131 @@
+"""What the memory is for: the table and the figure of results/memory, from the evaluations that its runs left there.
+
+    python benchmarks/run_seeds.py benchmarks/memory_jobs.txt --at-once 2 --numbers     # trains what is missing: hours
+    python benchmarks/memory.py                                                         # prints, draws: seconds
+
+Each row is one way of learning, each figure the median over its seeds with the range of all. Rows without a finished
+run are left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+from evaluate import read_json  # noqa: E402
+
+
+@dataclass
+class Experiment:
+    """Runs that differ by their memory alone: what is asked, and the keys of eval.json that answer."""
+
+    title: str
+    rows: dict[str, str]  # folder below results/memory/<experiment> -> what is printed of it
+    keys: dict[str, str]  # key of eval.json -> what is printed of it; the first is drawn
+    log: bool = False  # the figure's axis
+
+
+def lengths(*steps):
+    return {f"memory_{L}": f"L_mem {L}" for L in steps}
+
+
+EXPERIMENTS = {
+    "rocket": Experiment(
+        "Dispersed rocket, cut-off: ||error|| over 1705 flights",
+        {
+            **lengths(0, 8, 32, 128),
+            "mlp": "MLP",
+            "true_mass": "L_mem 32, true mass seen",
+            "oracle": "L_mem 32, draw seen",
+        },
+        {
+            "dispersed_error_median": "median",
+            "dispersed_error_p95": "p95",
+            "dispersed_perigee_error_std_km": "perigee, sigma (km)",
+            "dispersed_box_rate": "in the box",
+            "dispersed_mass_mean_kg": "mass (kg)",
+        },
+        log=True,
+    ),
+    "hidden_phase": Experiment(
+        "Double integrator, two waypoints, time and phase hidden: share of the starts that hit both circles",
+        {**lengths(0, 8, 32, 100), "shown": "L_mem 32, both shown"},
+        {"hit_rate": "hit both", "hit_rate_phase_1": "circle 1", "hit_rate_phase_2": "circle 2", "cost_mean": "cost J"},
+    ),
+    "hidden_velocity": Experiment(
+        "Double integrator, velocity hidden: cost over the optimum's, which sees it (ratio of sums)",
+        {**lengths(0, 1, 4, 32), "shown": "L_mem 32, velocity shown"},
+        {"ratio_of_sums": "ratio of sums", "ratio_p95": "p95", "hit_rate": "hit the circle"},
+    ),
+}
+
+
+def read(folder, rows):
+    """The evaluations of every seed: row -> list of eval.json."""
+    found = {row: [read_json(path) for path in sorted((folder / row / "seeds").glob("*.json"))] for row in rows}
+    return {row: seeds for row, seeds in found.items() if seeds}
+
+
+def cell(values):
+    """Median and range of the seeds' values, to four significant figures."""
+    if not values:
+        return "-"
+    low, middle, high = (f"{value:.4g}" for value in (min(values), np.median(values), max(values)))
+    return middle if len(values) == 1 else f"{middle} ({low} to {high})"
+
+
+def table(experiment, found):
+    """The lines of one experiment's table."""
+    lines = [["", "seeds", *experiment.keys.values()]]
+    for row, seeds in found.items():
+        cells = [cell([run[key] for run in seeds if key in run]) for key in experiment.keys]
+        lines.append([experiment.rows[row], str(len(seeds)), *cells])
+    widths = [max(map(len, column)) for column in zip(*lines)]
+    printed = ["  ".join(word.ljust(width) for word, width in zip(line, widths)).rstrip() for line in lines]
+    return [experiment.title, *(f"  {line}" for line in printed)]
+
+
+def draw(results):
+    """One panel an experiment: each seed a dot, their median a bar."""
+    figure = Figure(figsize=(5 * len(results), 4.5), layout="constrained")
+    panels = figure.subplots(1, len(results), squeeze=False)[0]
+    for ax, (name, found) in zip(panels, results.items()):
+        experiment = EXPERIMENTS[name]
+        key, label = next(iter(experiment.keys.items()))
+        for x, seeds in enumerate(found.values()):
+            values = [run[key] for run in seeds if key in run]
+            ax.plot([x] * len(values), values, "o", color="tab:red", alpha=0.6)
+            if values:
+                ax.hlines(np.median(values), x - 0.3, x + 0.3, color="tab:red")
+        ax.set_xticks(range(len(found)), [experiment.rows[row] for row in found], rotation=30, ha="right")
+        ax.set(ylabel=label, yscale="log" if experiment.log else "linear")
+        ax.set_title(experiment.title.replace(": ", ":\n"), fontsize=9)
+        ax.grid(alpha=0.3)
+    return figure
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", type=Path, nargs="?", default=ROOT / "results" / "memory")
+    folder = parser.parse_args().folder
+    try:
+        results = {name: read(folder / name, experiment.rows) for name, experiment in EXPERIMENTS.items()}
+        results = {name: found for name, found in results.items() if found}
+        if not results:
+            raise ValueError(f"{folder} has no finished run; benchmarks/memory_jobs.txt lists them")
+        for name, found in results.items():
+            print("\n".join(table(EXPERIMENTS[name], found)))
+        draw(results).savefig(folder / "memory.png", dpi=100)
+    except (OSError, ValueError) as error:
+        sys.exit(f"error: {error}")
+
+
+if __name__ == "__main__":
+    main()
