@@ -94,11 +94,12 @@ def held_mesh(rocket: Rocket, end: float) -> Mesh:
     return Mesh(t, np.zeros(len(t)), t_u, column, (end, end), 0)
 
 
-def collocation(rocket: Rocket):
+def collocation(rocket: Rocket, in_wind: bool = False):
     """Interval of Gauss-Legendre collocation: CasADi function (x, z, u, (m, T, flow, dt)) -> (defects, x at the end).
 
     The scaled r, v are the polynomial through x (6,) at the start and z (6, points) at the Gauss points; a defect is
-    its derivative there minus the dynamics' ("derivative form", e.g. Garg et al., Automatica 46, 2010).
+    its derivative there minus the dynamics' ("derivative form", e.g. Garg et al., Automatica 46, 2010). With `in_wind`
+    the engine's four numbers are followed by the air's: the factor on the drag, the wind towards east and north (m/s).
     """
     import casadi as ca
 
@@ -107,13 +108,18 @@ def collocation(rocket: Rocket):
     scale = ca.DM(state_scale(rocket))
     x, z, u = ca.SX.sym("x", 6), ca.SX.sym("z", 6, len(tau)), ca.SX.sym("u", 3, len(tau))
     mass, thrust, flow, dt = engine = ca.vertsplit(ca.SX.sym("engine", 4))
+    drag, *wind = air = ca.vertsplit(ca.SX.sym("air", 3)) if in_wind else [None]
     rates = []
     for j in range(len(tau)):
-        state = (*ca.vertsplit(scale * z[:, j]), mass - flow * tau[j] * dt)
-        rates.append(ca.vertcat(*envs.ascent(state, (*ca.vertsplit(u[:, j]), thrust, flow), rocket)[:6]) / scale)
+        state, control = (
+            (*ca.vertsplit(scale * z[:, j]), mass - flow * tau[j] * dt),
+            (*ca.vertsplit(u[:, j]), thrust, flow),
+        )
+        rates.append(ca.vertcat(*envs.ascent(state, control, rocket, wind or None, drag)[:6]) / scale)
     nodes = ca.horzcat(x, z)
     defects = nodes @ C - dt * ca.horzcat(*rates)
-    return ca.Function("collocation", [x, z, u, ca.vertcat(*engine)], [defects, nodes @ D])
+    parameters = ca.vertcat(*engine, *(air if in_wind else []))
+    return ca.Function("collocation", [x, z, u, parameters], [defects, nodes @ D])
 
 
 def held_step(rocket: Rocket):
@@ -137,6 +143,17 @@ def burning(rocket: Rocket, t):
     return thrust[arc], flow[arc], start[arc], mass[arc]
 
 
+def orbit_defect(rocket: Rocket, x, h_target, e_target):
+    """Five independent numbers that are 0 where a state x (r, v; a CasADi symbol) is on the orbit of these vectors.
+
+    e is normal to h: once h is the target's, two components of e are left, in the plane of the rocket's target.
+    """
+    import casadi as ca
+
+    h, e = (ca.vertcat(*vector) for vector in envs.orbit_vectors(ca.vertsplit(x), rocket.mu))
+    return ca.vertcat((h - h_target) / ca.norm_2(h_target), ca.DM(envs.target_axes(rocket)[:2]) @ (e - e_target))
+
+
 def ascent_program(case: Ascent, mesh: Mesh):
     """The nonlinear program as CasADi symbols: unknowns x (6, n) at the intervals' ends, z, u (3, m), final time.
 
@@ -156,10 +173,8 @@ def ascent_program(case: Ascent, mesh: Mesh):
     x0[3] += 1e-16  # |v_rel| has no derivative where it is 0, as it is on the ground
     interval = collocation(rocket) if mesh.points else held_step(rocket)
     defects, ends = interval.map(n)(ca.horzcat(x0, x[:, :-1]), z, u[:, mesh.column.tolist()], engine)
-    h, e = (ca.vertcat(*vector) for vector in envs.orbit_vectors(ca.vertsplit(ca.DM(scale) * x[:, -1]), rocket.mu))
-    h_target, e_target = (ca.DM(vector) for vector in envs.target_orbit(rocket.target, rocket.mu))
-    # e is normal to h: once h is the target's, two components of e are left
-    orbit = ca.vertcat((h - h_target) / ca.norm_2(h_target), ca.DM(envs.target_axes(rocket)[:2]) @ (e - e_target))
+    target = (ca.DM(vector) for vector in envs.target_orbit(rocket.target, rocket.mu))
+    orbit = orbit_defect(rocket, ca.DM(scale) * x[:, -1], *target)
     constraints = ca.veccat(defects, x - ends, ca.sum1(u**2) - 1, orbit, ca.sqrt(ca.sum1(x[:3, :] ** 2)))
     cost = end / (scale[0] / scale[3]) if case.free else ca.sumsqr(u[:, 1:] - u[:, :-1])
     return {"x": ca.veccat(x, z, u, end), "f": cost, "g": constraints}
