@@ -114,8 +114,13 @@ class Comparison:
             self.about[name]["decision_us"] = evaluate.decision_us(self.env_id, law)
 
     def solve(self, reached=None) -> list:
-        """The optima that know the draws of the first flights, to the target or to the orbits of `reached` (n, 7)."""
+        """The optima that know the draws of the first flights, to the target or to the orbits of `reached`.
+
+        `reached`: states (n, 7) of one law after the other; solved in one go, since processes take seconds to start.
+        """
         z = evaluate.draws(self.rocket, self.dispersion, self.eval_seed, self.solved)
+        if reached is not None:
+            z = np.tile(z, (len(reached) // len(z), 1))
         return opponents.drawn_optima(self.env_id, self.dispersion, z, reached, PROCESSES)
 
     def metrics(self, name: str, n: int) -> dict:
@@ -126,22 +131,19 @@ class Comparison:
         starts = len(flights["error_norm"])
         return {"dispersed_starts": starts} | evaluate.dispersed_metrics(flights, self.rocket)
 
-    def shares(self, name: str) -> dict:
-        """A law's mass over that of the optimum that knows the draw: to the target, and to the orbit that it reached.
+    def shares(self, name: str, reached: list) -> dict:
+        """A law's mass over that of the optimum that knows the draw: to the target, and to the orbit that it `reached`.
 
         Of those of the first flights that are successes and whose optimum was found.
         """
-        ends = {key: value[: self.solved] for key, value in self.arrays[name].items()}
-        success, shares = np.linalg.norm(ends["final_error"], axis=1) < evaluate.SUCCESS, {}
-        for key, optima in (("target", self.optima), ("reached", self.solve(ends["final_y"]))):
+        ends, shares = {key: value[: self.solved] for key, value in self.arrays[name].items()}, {}
+        success = np.linalg.norm(ends["final_error"], axis=1) < evaluate.SUCCESS
+        for key, optima in (("target", self.optima), ("reached", reached)):
             mass = np.array([optimum["final_mass"] if optimum else np.nan for optimum in optima])
             share = (ends["final_y"][:, 6] / mass)[success & np.isfinite(mass)]
             shares[f"share_{key}_flights"] = len(share)
             if len(share):
-                shares[f"share_{key}_mean"], shares[f"share_{key}_median"] = (
-                    float(share.mean()),
-                    float(np.median(share)),
-                )
+                shares |= {f"share_{key}_mean": float(share.mean()), f"share_{key}_median": float(np.median(share))}
         return shares
 
     def report(self) -> dict:
@@ -151,10 +153,11 @@ class Comparison:
         report["bound_flights"] = len(masses)
         if masses:
             report["bound_mass_mean_kg"] = float(np.mean(masses))
+        reached = self.solve(np.concatenate([arrays["final_y"][: self.solved] for arrays in self.arrays.values()]))
         laws = {}
-        for name, about in self.about.items():
-            first = {"first": self.metrics(name, self.solved)} | self.shares(name)
-            laws[name] = about | self.metrics(name, self.n) | first
+        for k, (name, about) in enumerate(self.about.items()):
+            shares = self.shares(name, reached[k * self.solved : (k + 1) * self.solved])
+            laws[name] = about | self.metrics(name, self.n) | {"first": self.metrics(name, self.solved)} | shares
         return report | {"laws": laws}
 
 
