@@ -2,12 +2,12 @@
 
     replay        the optimum's directions, open loop
     tvlqr         time-varying LQR about the optimum
-    replan        open loop through the air, then IPOPT with the nominal model from the measured state, every 20 s
-    drawn_optimum the optimum of a flight's own vehicle and air: a bound, not a law
+    Replan        open loop through the air, then IPOPT with the nominal model from the measured state, every 20 s
+    drawn_optima  the optimum of each flight's own vehicle and air: a bound, not a law
 
 A law is `policy(obs (m, obs), t) -> action (m, 3)`, directions in ECI, as `evaluate.evaluate_dispersed` flies it with
 the environment's own `action_frame="eci"`; it sees r, v, the flight computer's mass, time and phase, never the draw.
-Reading order: replay, LQR, the program of the rest of an ascent, replanning, the bound. `evaluate.py` flies, compares
+Reading order: replay, LQR, the program of the rest of an ascent, replanning, the bound. `comparison.py` flies, compares
 and prints them. CasADi is imported only where it solves.
 """
 
@@ -16,7 +16,7 @@ from __future__ import annotations
 import time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from functools import cache
+from functools import cache, lru_cache
 from multiprocessing import get_context
 from typing import NamedTuple
 
@@ -40,9 +40,20 @@ from rocket_baselines import (
 # ---------------------------------------------------------------------------------------------------------------------
 
 
+@lru_cache(maxsize=4)
+def kept_optimum(env_id: str, mission: Mission) -> dict:
+    """`rocket_reference`, flown once; the mission tells apart what an id was registered for before and is now."""
+    return rocket_reference(env_id)
+
+
+def nominal_optimum(env_id: str) -> dict:
+    """The optimum of the nominal vehicle as the environment flies it: t, u, y and more."""
+    return kept_optimum(env_id, envs.ROCKETS[env_id])
+
+
 def replay(env_id: str):
     """The optimum's directions in ECI by time, the last one held where a flight lasts longer."""
-    u = rocket_reference(env_id)["u"]
+    u = nominal_optimum(env_id)["u"]
     return lambda obs, t: np.repeat(u[None, min(t, len(u) - 1)], len(obs), axis=0)
 
 
@@ -72,8 +83,7 @@ def linearise_flight(mission: Mission, flight: dict, axes):
     """A (K, 6, 6) and B (K, 6, 2) of dx_{k+1} = A_k dx_k + B_k da_k along a flight, for the environment's own steps.
 
     x: r (m) and v (m/s); a: the two angles (rad) towards axes (K, 2, 3). Central differences of the nominal
-    environment, events included: all 16 neighbours of a state are one batch. Their differences, 10 m, 0.01 m/s and
-    1e-4 rad, are far above rounding, and the terms of third order that they leave below 1e-7.
+    environment, events included: the 16 neighbours of a state are one batch.
     """
     h = np.repeat([10.0, 0.01, 1e-4], [3, 3, 2])
     shifts = np.concatenate([np.diag(h), -np.diag(h)])  # (16, 8)
@@ -98,17 +108,19 @@ def cutoff_jacobian(rocket: Rocket, y, rate):
     """
     h = np.repeat([10.0, 0.01], 3)
     states = y[:6] + np.concatenate([np.diag(h), -np.diag(h)])
-    differences = lambda f: ((f[:6] - f[6:]) / (2 * h[:, None] if f.ndim > 1 else 2 * h)).T  # noqa: E731
-    error = differences(envs.terminal_error(states, rocket))
-    energy = differences(envs.specific_energy(states.T, rocket.mu))
-    return error @ (np.eye(6) - np.outer(rate, energy) / (energy @ rate))
+    values = np.column_stack(
+        [envs.terminal_error(states, rocket), envs.specific_energy(states.T, rocket.mu)]
+    )  # (12, 7)
+    *error, energy = ((values[:6] - values[6:]) / (2 * h[:, None])).T
+    return np.array(error) @ (np.eye(6) - np.outer(rate, energy) / (energy @ rate))
 
 
 def lqr_gains(mission: Mission, flight: dict, steering_weight: float = STEERING_WEIGHT):
     """Gains (K, 2, 6) of da_k = -G_k dx_k and the axes (K, 2, 3) of the angles, by the backward Riccati recursion.
 
-    Minimises |terminal error at the cut-off|^2 + sum of R dt |da|^2 for the flight linearised: no weight is put on
-    states on the way, which are free. About a heaviest flight every other is a loss of second order that R bounds.
+    Minimises |terminal error at the cut-off|^2 + sum of R dt |da|^2 along the linearised flight (e.g. Anderson and
+    Moore, Optimal Control, 1990). States on the way have no weight: only the end counts. Nor has the mass, which near
+    the heaviest flight depends on the steering in second order alone; R keeps that small.
     """
     axes = normal_axes(flight["u"])
     A, B = linearise_flight(mission, flight, axes)
@@ -130,7 +142,7 @@ def tvlqr(env_id: str, by_energy: bool = False, steering_weight: float = STEERIN
     with the cut-off, whenever that is. R and tilt were chosen on 341 draws of eval seed 1, others than the reported:
     a smaller R than 1e-7 gained nothing by either index, a larger tilt cost accuracy by time (0.1, 0.3, 0.6 rad).
     """
-    mission, flight = envs.ROCKETS[env_id], rocket_reference(env_id)
+    mission, flight = envs.ROCKETS[env_id], nominal_optimum(env_id)
     (gains, axes), y, u = lqr_gains(mission, flight, steering_weight), flight["y"], flight["u"]
     ignition = int(np.searchsorted(flight["t"], mission.rocket.last_ignition))
     energy = np.maximum.accumulate(envs.specific_energy(y[ignition:].T, mission.rocket.mu))
@@ -199,44 +211,54 @@ def rest_solver(rocket: Rocket, fixed: int, last: int):
     return ca.nlpsol("rest", "ipopt", program, options)
 
 
+def rest_grid(rest: Rest, intervals, end: float):
+    """Ends of the intervals (n+1,) and times of the directions (n * points,), s, of a rest that lasts until `end`."""
+    edges = [rest.begin, *rest.end[:-1], end]
+    pieces = (np.linspace(a, b, k + 1)[1:] for a, b, k in zip(edges, edges[1:], intervals))
+    t = np.concatenate([[rest.begin], *pieces])
+    return t, (t[:-1, None] + np.diff(t)[:, None] * GAUSS_POINTS).ravel()
+
+
+def rest_parameters(rocket: Rocket, rest: Rest, intervals) -> np.ndarray:
+    """The parameters of `rest_solver` in its order."""
+    fixed = sum(intervals[:-1])
+    t, arc = rest_grid(rest, intervals, rest.end[-1])[0], np.repeat(np.arange(len(intervals)), intervals)
+    mass = rest.mass[arc] - rest.flow[arc] * (t[:-1] - np.append(rest.begin, rest.end)[arc])
+    engine = np.array([mass, rest.thrust[arc], rest.flow[arc], np.diff(t)])[:, :fixed]
+    start = rest.state / state_scale(rocket)
+    start[3] += 1e-16  # as in ascent_program
+    burn = rest.mass[-1], rest.thrust[-1], rest.flow[-1]
+    return np.concatenate([start, engine.T.ravel(), burn, rest.air, rest.h, rest.e])
+
+
 def optimise_rest(rocket: Rocket, rest: Rest, guess: dict, intervals: tuple[int, ...]) -> dict:
     """The heaviest end of an ascent's rest, `intervals` of collocation in each of its arcs.
 
     The guess has t (s), y (r, v), t_u (s), u, as has what is returned, with `final_time` (s) and `final_mass` (kg).
     Raises NoOptimum where IPOPT finds none.
     """
-    *fixed, last = intervals
     n, points, scale = sum(intervals), len(GAUSS_POINTS), state_scale(rocket)
-    edges, arc = np.append(rest.begin, rest.end), np.repeat(np.arange(len(fixed)), fixed)
-    t = np.concatenate([[rest.begin], *(np.linspace(a, b, k + 1)[1:] for a, b, k in zip(edges, edges[1:], fixed))])
-    mass = rest.mass[arc] - rest.flow[arc] * (t[:-1] - edges[arc])
-    engine = np.array([mass, rest.thrust[arc], rest.flow[arc], np.diff(t)])
-    burn = rest.mass[-1], rest.thrust[-1], rest.flow[-1]
-    start = rest.state / scale
-    start[3] += 1e-16  # as in ascent_program
-    p = np.concatenate([start, engine.T.ravel(), burn, rest.air, rest.h, rest.e])
-    grid = lambda end: np.append(t, np.linspace(t[-1], end, last + 1)[1:])  # noqa: E731
-    inner = lambda t: (t[:-1, None] + np.diff(t)[:, None] * GAUSS_POINTS).ravel()  # noqa: E731
-    guessed = grid(guess["t"][-1])
-    times, t_u = np.append(guessed[1:], inner(guessed)), inner(guessed)
-    states, directions = interpolate(times, guess["t"], guess["y"]), interpolate(t_u, guess["t_u"], guess["u"])
-    w = np.concatenate([(states / scale).ravel(), directions.ravel(), [guessed[-1] - t[-1]]])
-    box = np.full(len(w) - 1, 2.0)
-    equal, radius = np.zeros(6 * n * points + 6 * n + n * points + 5), np.full(n, 1 + 1 / rocket.Re)
-    bounds = {"lbx": np.append(-box, 0.0), "ubx": np.append(box, rest.end[-1] - t[-1])}
+    solve, ignition = rest_solver(rocket, sum(intervals[:-1]), intervals[-1]), np.append(rest.begin, rest.end)[-2]
+    t, t_u = rest_grid(rest, intervals, guess["t"][-1])
+    states = interpolate(np.append(t[1:], t_u), guess["t"], guess["y"]) / scale
+    directions = interpolate(t_u, guess["t_u"], guess["u"])
+    w = np.concatenate([states.ravel(), directions.ravel(), [t[-1] - ignition]])
+    box = np.full(len(w) - 1, 2.0)  # as in ascend
+    equal, radius = np.zeros(n * (7 * points + 6) + 5), np.full(n, 1 + 1 / rocket.Re)
+    bounds = {"lbx": np.append(-box, 0.0), "ubx": np.append(box, rest.end[-1] - ignition)}
     bounds |= {"lbg": np.append(equal, radius), "ubg": np.append(equal, np.full(n, np.inf))}
-    solve = rest_solver(rocket, sum(fixed), last)
-    solution = solve(x0=w, p=p, **bounds)
+    solution = solve(x0=w, p=rest_parameters(rocket, rest, intervals), **bounds)
     status = solve.stats()["return_status"]
     if status != "Solve_Succeeded":
         raise NoOptimum(f"the rest of an ascent from {rest.begin} s: IPOPT stopped with {status}")
     w = solution["x"].full()[:, 0]
-    nodes = grid(t[-1] + w[-1])
-    states, t_u = w[: 6 * n * (1 + points)].reshape(-1, 6) * scale, inner(nodes)
-    order = np.argsort(np.append(nodes[1:], t_u))
-    found = {"t": np.append(rest.begin, np.append(nodes[1:], t_u)[order]), "y": np.vstack([rest.state, states[order]])}
+    end = ignition + w[-1]
+    t, t_u = rest_grid(rest, intervals, end)
+    times, states = np.append(t[1:], t_u), w[: 6 * n * (1 + points)].reshape(-1, 6) * scale
+    order = np.argsort(times)
+    found = {"t": np.append(rest.begin, times[order]), "y": np.vstack([rest.state, states[order]])}
     found |= {"t_u": t_u, "u": w[6 * n * (1 + points) : -1].reshape(-1, 3), "status": status}
-    return found | {"final_time": nodes[-1], "final_mass": rest.mass[-1] - rest.flow[-1] * w[-1]}
+    return found | {"final_time": end, "final_mass": rest.mass[-1] - rest.flow[-1] * w[-1]}
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -250,7 +272,7 @@ REPLAN_INTERVALS = 8  # of collocation: 12 change the final mass by less than 1e
 
 def optimum_guess(env_id: str) -> dict:
     """The nominal optimum as a guess of `optimise_rest`."""
-    flight = rocket_reference(env_id)
+    flight = nominal_optimum(env_id)
     middle = (flight["t"][:-1] + flight["t"][1:]) / 2
     return {"t": flight["t"], "y": flight["y"][:, :6], "t_u": middle, "u": flight["u"]}
 
@@ -263,15 +285,15 @@ def held(plan: dict, times):
 
 
 def replan_one(task):
-    """(plan, seconds) of one flight: task is (rocket, rest, guess); the plan is None where IPOPT finds none."""
+    """(plan, seconds on one core) of one flight: task is (rocket, rest, guess); the plan is None where IPOPT finds none."""
     rocket, rest, guess = task
     rest_solver(rocket, 0, REPLAN_INTERVALS)  # built before the clock runs
-    begin = time.perf_counter()
+    begin = time.process_time()
     try:
         plan = optimise_rest(rocket, rest, guess, (REPLAN_INTERVALS,))
     except NoOptimum:
         plan = None
-    return plan, time.perf_counter() - begin
+    return plan, time.process_time() - begin
 
 
 class Replan:
@@ -307,22 +329,23 @@ class Replan:
     def __call__(self, obs, t):
         if t == 0:
             self.plans = [self.guess] * len(obs)
-            steps = range(len(self.middles))
-            self.u = np.stack([self.replay(obs, step) for step in steps], axis=1)  # (m, steps, 3)
+            self.u = np.stack([self.replay(obs, step) for step in range(len(self.middles))], axis=1)  # (m, steps, 3)
         if t % round(REPLAN_EVERY / self.rocket.dt) == 0:
             self.replan(obs, t)
         return self.u[:, min(t, len(self.middles) - 1)]
 
     def replan(self, obs, t):
         """New plans from step t on for the flights of obs (m, 9) in the last burn that are not about to end it."""
-        now, (*_, (_, _, thrust, flow, _)) = self.rocket.dt * t, self.rocket.arcs()
-        lit = obs[:, 8] >= min(len(self.rocket.burns) - 1, 1)
+        rocket, now = self.rocket, self.rocket.dt * t
+        burn = rocket.burns[-1]
+        flow = burn.flow(rocket.table_isp)
+        lit = obs[:, 8] >= min(len(rocket.burns) - 1, 1)
         who = [k for k in np.flatnonzero(lit) if self.plans[k]["t"][-1] - now > LAST_REPLAN]
         tasks = []
         for k in who:
-            latest = now + (obs[k, 6] - self.rocket.dry_mass) / flow
-            arc = (np.array([value]) for value in (latest, thrust, flow, obs[k, 6]))
-            tasks.append((self.rocket, Rest(now, obs[k, :6], *arc, *self.target), self.plans[k]))
+            latest = now + (obs[k, 6] - rocket.dry_mass) / flow
+            arc = (np.array([value]) for value in (latest, burn.thrust, flow, obs[k, 6]))
+            tasks.append((rocket, Rest(now, obs[k, :6], *arc, *self.target), self.plans[k]))
         chunk = -(-len(tasks) // (2 * self.processes)) or 1
         found = self.pool.map(replan_one, tasks, chunksize=chunk) if self.pool else map(replan_one, tasks)
         for k, (plan, seconds) in zip(who, found):
