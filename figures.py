@@ -448,6 +448,10 @@ def draw_ground_track(ax, arrays: dict, rocket: envs.Rocket):
     ax.legend(loc="lower left")
 
 
+# policies first; not green, which is the target's
+LAWS = ("tab:red", "tab:orange", "tab:purple", "tab:cyan", "tab:brown", "tab:blue", "tab:pink", "tab:olive", "tab:gray")
+
+
 def draw_dispersed(laws: dict[str, dict], metrics: dict) -> Figure:
     """Where dispersed flights end: perigee over its argument, inclination over the node, distribution of ||error||.
 
@@ -457,6 +461,8 @@ def draw_dispersed(laws: dict[str, dict], metrics: dict) -> Figure:
     rocket = envs.ROCKETS[metrics["env_id"]].rocket
     figure = Figure(figsize=(15, 5), layout="constrained")
     *scatters, distribution = figure.subplots(1, 3)
+    for ax in figure.axes:
+        ax.set_prop_cycle(color=LAWS)
     labels = {"perigee_km": "perigee (km)", "i_deg": "inclination (deg)"}
     labels |= {"raan_deg": "right ascension of the node (deg)", "argp_deg": "argument of perigee (deg)"}
     for ax, (x, y) in zip(scatters, (("argp_deg", "perigee_km"), ("raan_deg", "i_deg"))):

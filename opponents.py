@@ -6,7 +6,8 @@
     drawn_optima  the optimum of each flight's own vehicle and air: a bound, not a law
 
 A law is `policy(obs (m, obs), t) -> action (m, 3)`, directions in ECI, as `evaluate.evaluate_dispersed` flies it with
-the environment's own `action_frame="eci"`; it sees r, v, the flight computer's mass, time and phase, never the draw.
+the environment's own `action_frame="eci"`; it sees r and v without noise, as a policy does, the flight computer's mass,
+time and phase, never the draw.
 Reading order: replay, LQR, the program of the rest of an ascent, replanning, the bound. `comparison.py` flies, compares
 and prints them. CasADi is imported only where it solves.
 """
@@ -285,7 +286,7 @@ def held(plan: dict, times):
 
 
 def replan_one(task):
-    """(plan, seconds on one core) of one flight: task is (rocket, rest, guess); the plan is None where IPOPT finds none."""
+    """The plan of one flight, None where IPOPT finds none, and its seconds on one core; task: (rocket, rest, guess)."""
     rocket, rest, guess = task
     rest_solver(rocket, 0, REPLAN_INTERVALS)  # built before the clock runs
     begin = time.process_time()
