@@ -3,10 +3,12 @@
     python evaluate.py publish RUN_DIR results/di     # add a run to a results folder (--ship: make it the shipped one)
     python evaluate.py figures results/di             # redraw its figures and print its table (a run folder works too)
     python evaluate.py animate results/di             # and its figures/animation.gif
+    python evaluate.py opponents results/rocket_cutoff     # classical guidance on its policy's dispersed flights
 
-Reading order: cases and ratios, table, files, training curves, rocket ascent (its metrics and table), results folders,
-command line. The figures are in `figures.py` and `animation.py`, imported only where something is drawn. The names of
-all metrics (`eval.json`) and arrays (`eval.npz`) are the interface of the project. Costs are the paper's J: plain sums.
+Reading order: cases and ratios, table, files, training curves, rocket ascent (its metrics and table), dispersed
+flights, results folders, command line. The figures are in `figures.py` and `animation.py`, imported only where
+something is drawn, the comparison with opponents in `comparison.py`. The names of all metrics (`eval.json`) and arrays
+(`eval.npz`) are the interface of the project. Costs are the paper's J: plain sums.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ import hashlib
 import json
 import math
 import sys
+import time
 import zipfile
 from functools import lru_cache
 from pathlib import Path
@@ -26,7 +29,7 @@ import safetensors.numpy
 
 import baselines
 import envs
-from baselines import replacing, starts
+from baselines import OneLineParser, integer, replacing, starts
 from envs import BadInput
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -643,6 +646,27 @@ def box_rate(inside: int, n: int) -> dict:
     }
 
 
+def final_elements(y: np.ndarray, rocket: envs.Rocket) -> dict:
+    """The elements of states (n, 7) in the names of `final_info`."""
+    elements = envs.orbital_elements(y, rocket.mu)
+    degrees = {f"{name}_deg": np.degrees(getattr(elements, name)) for name in ("i", "raan", "argp")}
+    return {"a_km": elements.a / 1e3, "e": elements.e, **degrees}
+
+
+def decision_us(env_id: str, policy, **env_options) -> float:
+    """Median microseconds on one core of a policy's decision, over a flight that is alone in its batch."""
+    seconds = []
+
+    def timed(obs, t):
+        begin = time.process_time()
+        action = policy(obs, t)
+        seconds.append(time.process_time() - begin)
+        return action
+
+    envs.fly_rocket(env_id, timed, **env_options)
+    return 1e6 * float(np.median(seconds))
+
+
 def dispersed_lines(metrics: dict) -> list[str]:
     """The lines below the rocket's table on its dispersed flights; none where none were flown."""
     if "dispersion" not in metrics:
@@ -741,9 +765,28 @@ def seed_lines(folder) -> list[str]:
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def main():
-    """`python evaluate.py publish RUN_DIR FOLDER [--ship]`, `... figures FOLDER` and `... animate FOLDER`."""
-    parser = argparse.ArgumentParser(description="Results folders: add a run, redraw figures, print the table.")
+def named_path(text: str) -> tuple[str, Path]:
+    """Argument type: NAME=PATH."""
+    name, _, path = text.partition("=")
+    if not name or not path:
+        raise argparse.ArgumentTypeError(f"{text!r} must be NAME=PATH, a name and an agent.safetensors")
+    return name, Path(path)
+
+
+def positive(text: str) -> float:
+    """Argument type: a dispersion that disperses."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value <= 10:
+        raise argparse.ArgumentTypeError(f"{text!r} must be a number above 0, at most 10")
+    return value
+
+
+def parse_args(argv=None):
+    """`publish RUN_DIR FOLDER [--ship]`, `figures FOLDER`, `animate FOLDER`, `opponents FOLDER [...]`."""
+    parser = OneLineParser(description="Results folders: add a run, redraw figures, print the table.")
     commands = parser.add_subparsers(dest="command", required=True)
     command = commands.add_parser("publish", help="add a run to a results folder")
     command.add_argument("run_dir", type=Path, help="a finished run: runs/...")
@@ -753,10 +796,33 @@ def main():
     command.add_argument("folder", type=Path, help="results/<name> or runs/...")
     command = commands.add_parser("animate", help="write figures/animation.gif of a results or run folder")
     command.add_argument("folder", type=Path, help="results/<name> or runs/...")
-    args = parser.parse_args()
+    command = commands.add_parser(
+        "opponents", help="classical guidance and other policies on the same dispersed flights"
+    )
+    command.add_argument("folder", type=Path, help="results/<name> of a rocket with cut-off")
+    command.add_argument("--dispersion", type=positive, default=1.0, metavar="K", help="default 1: envs.Dispersion")
+    size = integer(10, 100_000)
+    command.add_argument("--starts", type=size, default=DISPERSED_STARTS, metavar="N", help="flights, default 1705")
+    command.add_argument(
+        "--solved", type=size, default=200, metavar="N", help="the first of them, for IPOPT: default 200"
+    )
+    command.add_argument("--eval-seed", type=integer(0, 2**31 - 1), default=0, metavar="S", help="default 0")
+    also = "another policy, as often as wanted"
+    command.add_argument("--also", type=named_path, action="append", default=[], metavar="NAME=PATH", help=also)
+    return parser.parse_args(argv)
+
+
+def main():
+    """Run the sub-command; what can go wrong in it ends in one line."""
+    args = parse_args()
     try:
         if args.command == "animate":
             print(animate(args.folder))
+            return
+        if args.command == "opponents":
+            import comparison
+
+            comparison.run(args.folder, args.dispersion, args.starts, args.solved, args.eval_seed, args.also)
             return
         if args.command == "publish":
             publish(args.run_dir, args.folder, args.ship)
@@ -764,7 +830,7 @@ def main():
             for path in redraw(args.folder):
                 print(path)
         print("\n".join([table(read_json(args.folder / "eval.json")), *seed_lines(args.folder)]))
-    except (OSError, ValueError) as error:
+    except (ImportError, OSError, RuntimeError, ValueError) as error:
         sys.exit(f"evaluate.py: {error}")
 
 

@@ -17,7 +17,16 @@ from matplotlib.ticker import EngFormatter
 
 import envs
 from baselines import replacing
-from evaluate import BOX, NEAR_ORIGIN, SUCCESS, altitude_km, comparable, cost_parts, element_misses
+from evaluate import (
+    BOX,
+    NEAR_ORIGIN,
+    SUCCESS,
+    altitude_km,
+    comparable,
+    cost_parts,
+    element_misses,
+    final_elements,
+)
 
 # ---------------------------------------------------------------------------------------------------------------------
 # What every problem shows: policy red, optimum blue, target green, as in the paper. Time is in s; x, u, J have no unit
@@ -46,6 +55,11 @@ def draw(folder, arrays: dict, metrics: dict, curve: dict | None = None, others=
         drawn |= {"trajectories.png": draw_trajectories(arrays, metrics), "costs.png": draw_costs(arrays, metrics)}
         if len(envs.PROBLEMS[metrics["env_id"]].phases) == 1:  # with waypoints a missed circle would count as a gain
             drawn |= {"cost_error.png": draw_cost_error(arrays, metrics)}
+    return save(folder, drawn)
+
+
+def save(folder, drawn: dict[str, Figure]) -> list[Path]:
+    """Write figures by their file names; returns the paths."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     for name, figure in drawn.items():
@@ -434,6 +448,10 @@ def draw_ground_track(ax, arrays: dict, rocket: envs.Rocket):
     ax.legend(loc="lower left")
 
 
+# policies first; not green, which is the target's
+LAWS = ("tab:red", "tab:orange", "tab:purple", "tab:cyan", "tab:brown", "tab:blue", "tab:pink", "tab:olive", "tab:gray")
+
+
 def draw_dispersed(laws: dict[str, dict], metrics: dict) -> Figure:
     """Where dispersed flights end: perigee over its argument, inclination over the node, distribution of ||error||.
 
@@ -443,6 +461,8 @@ def draw_dispersed(laws: dict[str, dict], metrics: dict) -> Figure:
     rocket = envs.ROCKETS[metrics["env_id"]].rocket
     figure = Figure(figsize=(15, 5), layout="constrained")
     *scatters, distribution = figure.subplots(1, 3)
+    for ax in figure.axes:
+        ax.set_prop_cycle(color=LAWS)
     labels = {"perigee_km": "perigee (km)", "i_deg": "inclination (deg)"}
     labels |= {"raan_deg": "right ascension of the node (deg)", "argp_deg": "argument of perigee (deg)"}
     for ax, (x, y) in zip(scatters, (("argp_deg", "perigee_km"), ("raan_deg", "i_deg"))):
@@ -461,14 +481,9 @@ def draw_dispersed(laws: dict[str, dict], metrics: dict) -> Figure:
         ax.grid(alpha=0.3)
     handles, names = distribution.get_legend_handles_labels()
     handles.append(Line2D([], [], **TARGET))
-    figure.legend(handles, [*names, "a launcher's accuracy"], loc="outside lower center", ncols=len(handles))
-    flights = f"{metrics['dispersed_starts']} flights at dispersion {metrics['dispersion']:g}"
-    figure.suptitle(f"{metrics['env_id']}: {flights}, {metrics['dispersed_box_rate']:.1%} inside the box")
+    figure.legend(handles, [*names, "a launcher's accuracy"], loc="outside lower center", ncols=min(len(handles), 5))
+    title = f"{metrics['env_id']} at dispersion {metrics['dispersion']:g}"
+    if len(laws) == 1:
+        title += f": {metrics['dispersed_box_rate']:.1%} of {metrics['dispersed_starts']} flights inside the box"
+    figure.suptitle(title)
     return figure
-
-
-def final_elements(y: np.ndarray, rocket: envs.Rocket) -> dict:
-    """The elements of states (n, 7) in the names of `final_info`."""
-    elements = envs.orbital_elements(y, rocket.mu)
-    degrees = {f"{name}_deg": np.degrees(getattr(elements, name)) for name in ("i", "raan", "argp")}
-    return {"a_km": elements.a / 1e3, "e": elements.e, **degrees}

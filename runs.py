@@ -421,6 +421,9 @@ class Run:
         metrics, arrays = self.evaluate(args.eval_seed)
         metrics |= evaluate.mass_reached(metrics)
         if args.eval_only:
+            if "dispersion" in metrics:
+                policy = self.modules["average"].module.make_policy(self.envs.episode_steps)
+                metrics["decision_us"] = evaluate.decision_us(args.env_id, policy, **self.env_options)
             evaluate.write(metrics, arrays, args.checkpoint, args.eval_json, args.eval_npz)
             print(evaluate.table(metrics))
             return

@@ -327,7 +327,7 @@ def test_missing_reference_is_solved_and_options_reach_the_environment(monkeypat
     assert set(seen) == {0.0}
 
 
-@pytest.mark.parametrize("module", ["envs", "baselines", "evaluate", "figures", "animation"])
+@pytest.mark.parametrize("module", ["envs", "baselines", "opponents", "evaluate", "comparison", "figures", "animation"])
 def test_import_loads_nothing_heavy(module):
     """A training and `--help` wait for none of these; a figure needs Matplotlib, but no window."""
     heavy = {"torch", "casadi", "scipy", "matplotlib.pyplot"} | (

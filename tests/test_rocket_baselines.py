@@ -1,4 +1,4 @@
-"""The rocket's optima in baselines.py against published numbers, the maximum principle and their flights."""
+"""The rocket's optima in rocket_baselines.py against published numbers, the maximum principle and their flights."""
 
 import json
 import math
@@ -15,6 +15,7 @@ from rocket_oracle import single_burn
 
 import baselines
 import envs
+import rocket_baselines
 from baselines import ASCENTS, STORED, nine_pitch_angles, rocket_reference
 from envs import ROCKET, ROCKETS, fly_rocket, rk4
 from envs import ascent as dynamics
@@ -43,7 +44,7 @@ def command(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def flights(command):
-    """What the npz holds, flown by the environment without anything from baselines.py."""
+    """What the npz holds, flown by the environment without anything from rocket_baselines.py."""
     _, _, arrays = command
     return {key: fly(arrays, key) for key in VEHICLES}
 
@@ -167,7 +168,7 @@ def shipped(command, tmp_path, monkeypatch):
     """A copy of the command's files in the place of results/."""
     for path in command[0].iterdir():
         (tmp_path / path.name).write_bytes(path.read_bytes())
-    monkeypatch.setattr(baselines, "RESULTS", tmp_path)
+    monkeypatch.setattr(rocket_baselines, "RESULTS", tmp_path)
     return tmp_path
 
 
@@ -177,7 +178,7 @@ def refuse(case):
 
 @pytest.mark.parametrize("env_id", ["RocketAscent-v0", "RocketAscentCutoff-v0", "TwoStageLEO-v0"])
 def test_reference_is_the_solve(command, flights, shipped, monkeypatch, env_id):
-    monkeypatch.setattr(baselines, "solve_ascent", refuse)
+    monkeypatch.setattr(rocket_baselines, "solve_ascent", refuse)
     _, numbers, _ = command
     key, found = STORED.get(env_id, env_id), rocket_reference(env_id)
     assert found["reference_mass_kg"] == numbers[key]["final_mass_kg"]
@@ -229,7 +230,7 @@ def test_reference_is_solved_anew_where_the_files_do_not_serve(command, flights,
         solved.append(case.key)
         return command[1][case.key], flights[case.key], None
 
-    monkeypatch.setattr(baselines, "solve_ascent", solve)
+    monkeypatch.setattr(rocket_baselines, "solve_ascent", solve)
     found = rocket_reference("RocketAscentCutoff-v0")
     assert solved == ["free"] and found["error_norm"] < 2e-5
     assert found["reference_mass_kg"] == command[1]["free"]["final_mass_kg"]
@@ -336,7 +337,7 @@ def test_another_ceiling_is_another_reference(monkeypatch, flights, ceiling_km):
     solved = []
     numbers = {"final_mass_kg": 6644.0, "final_time_s": 961.0}
     monkeypatch.setattr(
-        baselines, "solve_ascent", lambda case: solved.append(case) or (numbers, flights["fixed"], None)
+        rocket_baselines, "solve_ascent", lambda case: solved.append(case) or (numbers, flights["fixed"], None)
     )
     monkeypatch.setitem(ROCKETS, "RocketAscent-v0", replace(ROCKETS["RocketAscent-v0"], ceiling_km=ceiling_km))
     found = rocket_reference("RocketAscent-v0")
@@ -347,7 +348,9 @@ def test_another_ceiling_is_another_reference(monkeypatch, flights, ceiling_km):
 def test_options_change_what_is_solved(monkeypatch, flights):
     solved = []
     numbers = {"final_mass_kg": 7000.0, "final_time_s": 924.0}
-    monkeypatch.setattr(baselines, "solve_ascent", lambda case: solved.append(case) or (numbers, flights["free"], None))
+    monkeypatch.setattr(
+        rocket_baselines, "solve_ascent", lambda case: solved.append(case) or (numbers, flights["free"], None)
+    )
     mine = replace(ROCKET, payload=4000.0)
     rocket_reference("RocketAscentCutoff-v0", rocket=mine)
     rocket_reference("RocketAscentCutoff-v0", table_isp=True)
@@ -374,7 +377,7 @@ def test_an_infeasible_ascent_is_an_error_of_one_line(changes, names):
 
 def test_a_rocket_without_the_energy_is_refused_before_any_solve(monkeypatch):
     """Its delta-v by Tsiolkovsky: 3.0 and 3.4 km/s times the mass ratios' logarithms, and 359 m/s of turning Earth."""
-    monkeypatch.setattr(baselines, "ascend", None)
+    monkeypatch.setattr(rocket_baselines, "ascend", None)
     m0 = 433e3 + 111.5e3 + 45e3
     delta_v = 7.6e6 * 162 / 411e3 * math.log(m0 / (m0 - 411e3))
     delta_v += 934e3 * 393 / 107.5e3 * math.log((111.5e3 + 45e3) / (4e3 + 45e3))
@@ -386,7 +389,7 @@ def test_a_rocket_without_the_energy_is_refused_before_any_solve(monkeypatch):
 
 def test_a_flight_that_misses_is_an_error(flights, monkeypatch):
     early = {"u": flights["fixed"]["u"], "final_time": 960.0}
-    monkeypatch.setattr(baselines, "ascend", lambda case, mesh, guess: early)
+    monkeypatch.setattr(rocket_baselines, "ascend", lambda case, mesh, guess: early)
     baselines.solve_ascent.cache_clear()
     with pytest.raises(RuntimeError, match="rocket ascent fixed: flown by the environment it misses by 0.0"):
         baselines.solve_ascent(ASCENTS["fixed"])

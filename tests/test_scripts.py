@@ -115,14 +115,17 @@ def imported(nodes):
     return {name.split(".")[0] for name in names}
 
 
-ROOMS = ["rocket", "envs", "baselines", "evaluate", "figures", "animation", "runs"]  # each imports only those before it
+# each imports only those before it
+ROOMS = ["rocket", "envs", "rocket_baselines", "baselines", "opponents", "evaluate", "comparison", "figures"]
+ROOMS += ["animation", "runs"]
+LAZILY = {"evaluate": {"comparison", "figures", "animation"}, "comparison": {"figures"}, "envs": {"animation"}}
 
 
 def test_imports_point_one_way():
-    """scripts -> runs -> animation -> figures -> evaluate -> baselines -> envs -> rocket; nothing imports a script.
+    """scripts -> runs -> animation -> figures -> comparison -> evaluate -> opponents -> ... -> envs -> rocket.
 
-    Figures and animation are imported where something is drawn: by evaluate's command line and an environment's
-    `render`, too, and, but for the one by the other, at no module's top.
+    Nothing imports a script. Figures and animation are imported where something is drawn: by evaluate's command line
+    and an environment's `render`, too, and, but for the one by the other, at no module's top.
     """
     rank = {name: k for k, name in enumerate(ROOMS)} | {path.stem: len(ROOMS) for path in SCRIPTS}
     for path in ROOT.rglob("*.py"):
@@ -130,15 +133,18 @@ def test_imports_point_one_way():
             continue
         tree = ast.parse(path.read_text())
         top, anywhere = imported(tree.body) & rank.keys(), imported(ast.walk(tree)) & rank.keys()
-        lazily = {"evaluate": {"figures", "animation"}, "envs": {"animation"}}.get(path.stem, set())
+        lazily = LAZILY.get(path.stem, set())
         own = min(rank.get(path.stem, len(ROOMS)), len(ROOMS))
         assert all(rank[name] < own for name in anywhere - lazily), (path, anywhere)
-        assert "animation" not in top and ("figures" not in top or path.stem == "animation"), path
+        assert (
+            "comparison" not in top and "animation" not in top and ("figures" not in top or path.stem == "animation")
+        ), path
 
 
 LIGHT = {"rocket": {"torch", "casadi", "scipy", "gymnasium"}, "envs": {"torch", "casadi", "scipy"}}
-LIGHT |= {"baselines": {"torch"}, "evaluate": {"torch", "casadi"}, "figures": {"torch", "casadi"}}
-LIGHT |= {"animation": {"torch", "casadi"}}
+LIGHT |= {"rocket_baselines": {"torch"}, "baselines": {"torch"}, "evaluate": {"torch", "casadi"}}
+LIGHT |= {"opponents": {"torch"}, "comparison": {"torch", "casadi"}}
+LIGHT |= {"figures": {"torch", "casadi"}, "animation": {"torch", "casadi"}}
 
 
 @pytest.mark.parametrize("room", [room for room in LIGHT if (ROOT / f"{room}.py").exists()])
@@ -146,8 +152,9 @@ def test_modules_stay_light(room):
     assert not imported(ast.walk(ast.parse((ROOT / f"{room}.py").read_text()))) & LIGHT[room]
 
 
-def test_casadi_is_imported_only_where_it_solves():
-    assert "casadi" not in imported(ast.parse((ROOT / "baselines.py").read_text()).body)
+@pytest.mark.parametrize("room", ["baselines", "rocket_baselines", "opponents"])
+def test_casadi_is_imported_only_where_it_solves(room):
+    assert "casadi" not in imported(ast.parse((ROOT / f"{room}.py").read_text()).body)
 
 
 @pytest.mark.parametrize("path", sorted(ROOT.glob("*.py")), ids=lambda path: path.name)

@@ -21,6 +21,7 @@ import baselines
 import envs
 import evaluate
 import figures
+import rocket_baselines
 from envs import BOOSTER, ROCKET, ROCKETS, BadInput, Burn, Engine, Rocket, register_rocket
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -140,7 +141,7 @@ def test_foreign_ids_are_refused(env_id):
 def test_registering_again_replaces(monkeypatch):
     """Environment, reference and evaluation are the new rocket's, with a warning where it is another one."""
     solved = []
-    monkeypatch.setattr(baselines, "solve_ascent", lambda case: solved.append(case.rocket) or 1 / 0)
+    monkeypatch.setattr(rocket_baselines, "solve_ascent", lambda case: solved.append(case.rocket) or 1 / 0)
     lighter = replace(TWO, payload=19e3)
     for rocket in (TWO, lighter):
         with warnings.catch_warnings(record=True) as caught:
@@ -339,7 +340,7 @@ def test_evaluation_is_against_the_rocket_that_flies(monkeypatch, option):
         flight = envs.fly_rocket(CUTOFF, lambda obs, t: np.array([[1.0, 0.1, 0.0]]), end_time=100.0, rocket=flown)
         return {"final_mass_kg": 4321.0, "final_time_s": 100.0}, flight, None
 
-    monkeypatch.setattr(baselines, "solve_ascent", solve)
+    monkeypatch.setattr(rocket_baselines, "solve_ascent", solve)
     policy = lambda obs, t: np.array([[1.0, 0.3, 0.0]])  # noqa: E731
     metrics, arrays = evaluate.evaluate(CUTOFF, policy, 0, 1, action_frame="local", **option)
     assert solved == [flown] and metrics["reference_mass_kg"] == 4321.0

@@ -1,0 +1,422 @@
+"""Opponents of a policy on dispersed flights: laws that know the nominal optimum or model, and the bound on the mass.
+
+    replay        the optimum's directions, open loop
+    tvlqr         time-varying LQR about the optimum
+    Replan        open loop through the air, then IPOPT with the nominal model from the measured state, every 20 s
+    drawn_optima  the optimum of each flight's own vehicle and air: a bound, not a law
+
+A law is `policy(obs (m, obs), t) -> action (m, 3)`, directions in ECI, as `evaluate.evaluate_dispersed` flies it with
+the environment's own `action_frame="eci"`; it sees r and v without noise, as a policy does, the flight computer's mass,
+time and phase, never the draw.
+Reading order: replay, LQR, the program of the rest of an ascent, replanning, the bound. `comparison.py` flies, compares
+and prints them. CasADi is imported only where it solves.
+"""
+
+from __future__ import annotations
+
+import time
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from functools import cache, lru_cache
+from multiprocessing import get_context
+from typing import NamedTuple
+
+import numpy as np
+
+import envs
+from envs import Mission, Rocket
+from rocket_baselines import (
+    GAUSS_POINTS,
+    MAX_ITERATIONS,
+    NoOptimum,
+    collocation,
+    interpolate,
+    orbit_defect,
+    rocket_reference,
+    state_scale,
+)
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Open loop
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+@lru_cache(maxsize=4)
+def kept_optimum(env_id: str, mission: Mission) -> dict:
+    """`rocket_reference`, flown once; the mission tells apart what an id was registered for before and is now."""
+    return rocket_reference(env_id)
+
+
+def nominal_optimum(env_id: str) -> dict:
+    """The optimum of the nominal vehicle as the environment flies it: t, u, y and more."""
+    return kept_optimum(env_id, envs.ROCKETS[env_id])
+
+
+def replay(env_id: str):
+    """The optimum's directions in ECI by time, the last one held where a flight lasts longer."""
+    u = nominal_optimum(env_id)["u"]
+    return lambda obs, t: np.repeat(u[None, min(t, len(u) - 1)], len(obs), axis=0)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Time-varying LQR about the optimum
+# ---------------------------------------------------------------------------------------------------------------------
+
+STEERING_WEIGHT = 1e-7  # R: what a radian of steering for a second costs, in squares of the terminal error
+LARGEST_TILT = 0.1  # rad that each of the two angles may turn a direction from the optimum's
+
+
+def turned(u, axes, angles):
+    """Directions (m, 3) turned from u (m, 3) towards axes (m, 2, 3), at right angles to it, by angles (m, 2) rad."""
+    w = u + (np.tan(angles)[..., None] * axes).sum(axis=-2)
+    return w / np.linalg.norm(w, axis=1, keepdims=True)
+
+
+def normal_axes(u):
+    """Two unit vectors at right angles to each direction u (K, 3) and to each other, (K, 2, 3)."""
+    smallest = np.eye(3)[np.abs(u).argmin(axis=1)]
+    first = np.cross(u, smallest)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack([first, np.cross(u, first)], axis=1)
+
+
+def linearise_flight(mission: Mission, flight: dict, axes):
+    """A (K, 6, 6) and B (K, 6, 2) of dx_{k+1} = A_k dx_k + B_k da_k along a flight, for the environment's own steps.
+
+    x: r (m) and v (m/s); a: the two angles (rad) towards axes (K, 2, 3). Central differences of the nominal
+    environment, events included: the 16 neighbours of a state are one batch.
+    """
+    h = np.repeat([10.0, 0.01, 1e-4], [3, 3, 2])
+    shifts = np.concatenate([np.diag(h), -np.diag(h)])  # (16, 8)
+    env = envs.RocketVectorEnv(len(shifts), replace(mission, cutoff=False))
+    env.end_time = flight["t"][-1]
+    env.reset()
+    jacobians = []
+    for k, (y, u) in enumerate(zip(flight["y"], flight["u"])):
+        env.t[:], env.y = k, y[:, None] + np.pad(shifts[:, :6], ((0, 0), (0, 1))).T
+        env.advance(turned(u, axes[k], shifts[:, 6:]))
+        ahead, behind = env.y[:6, :8], env.y[:6, 8:]
+        jacobians.append((ahead - behind) / (2 * h))
+    AB = np.array(jacobians)
+    return AB[..., :6], AB[..., 6:]
+
+
+def cutoff_jacobian(rocket: Rocket, y, rate):
+    """Derivative (6, 6) of the terminal error at the cut-off by r, v of a state y (7,) that moves at `rate` (6,).
+
+    The engine stops at the target's energy, whenever that is: dt = -E_x dx / (E_x rate) later than planned. What a
+    state is ahead or behind along the trajectory costs nothing, only what it is beside it.
+    """
+    h = np.repeat([10.0, 0.01], 3)
+    states = y[:6] + np.concatenate([np.diag(h), -np.diag(h)])
+    values = np.column_stack(
+        [envs.terminal_error(states, rocket), envs.specific_energy(states.T, rocket.mu)]
+    )  # (12, 7)
+    *error, energy = ((values[:6] - values[6:]) / (2 * h[:, None])).T
+    return np.array(error) @ (np.eye(6) - np.outer(rate, energy) / (energy @ rate))
+
+
+def lqr_gains(mission: Mission, flight: dict, steering_weight: float = STEERING_WEIGHT):
+    """Gains (K, 2, 6) of da_k = -G_k dx_k and the axes (K, 2, 3) of the angles, by the backward Riccati recursion.
+
+    Minimises |terminal error at the cut-off|^2 + sum of R dt |da|^2 along the linearised flight (e.g. Anderson and
+    Moore, Optimal Control, 1990). States on the way have no weight: only the end counts. Nor has the mass, which near
+    the heaviest flight depends on the steering in second order alone; R keeps that small.
+    """
+    axes = normal_axes(flight["u"])
+    A, B = linearise_flight(mission, flight, axes)
+    last, dt = flight["y"][-2:], np.diff(flight["t"])
+    C = cutoff_jacobian(mission.rocket, last[1], (last[1] - last[0])[:6] / dt[-1])
+    P, gains = C.T @ C, np.empty((len(B), 2, 6))
+    for k in reversed(range(len(B))):
+        gains[k] = np.linalg.solve(steering_weight * dt[k] * np.eye(2) + B[k].T @ P @ B[k], B[k].T @ P @ A[k])
+        P = A[k].T @ P @ (A[k] - B[k] @ gains[k])
+        P = (P + P.T) / 2
+    return gains, axes
+
+
+def tvlqr(env_id: str, by_energy: bool = False, steering_weight: float = STEERING_WEIGHT):
+    """LQR about the optimum, by time; `by_energy` from the last ignition on by the specific energy instead.
+
+    By time the cut-off is met by holding the last direction and gain from the optimum's end on. By energy, which grows
+    all through the last burn, a flight is compared with the optimum's state of its own energy: the last gain then comes
+    with the cut-off, whenever that is. R and tilt were chosen on 341 draws of eval seed 1, others than the reported:
+    a smaller R than 1e-7 gained nothing by either index, a larger tilt cost accuracy by time (0.1, 0.3, 0.6 rad).
+    """
+    mission, flight = envs.ROCKETS[env_id], nominal_optimum(env_id)
+    (gains, axes), y, u = lqr_gains(mission, flight, steering_weight), flight["y"], flight["u"]
+    ignition = int(np.searchsorted(flight["t"], mission.rocket.last_ignition))
+    energy = np.maximum.accumulate(envs.specific_energy(y[ignition:].T, mission.rocket.mu))
+    phi_last = min(len(mission.rocket.burns) - 1, 1)  # as observed in the last burn
+
+    def policy(obs, t):
+        place = np.full(len(obs), min(t, len(u) - 1.0))  # along the optimum, in its steps
+        if by_energy:
+            now = np.interp(envs.specific_energy(obs.T, mission.rocket.mu), energy, np.arange(ignition, len(y)))
+            place = np.where(obs[:, 8] >= phi_last, now, place)
+        step = np.minimum(place.astype(int), len(u) - 1)
+        part, nearest = (place - step)[:, None], np.minimum(np.rint(place).astype(int), len(u) - 1)
+        dx = obs[:, :6] - (1 - part) * y[step, :6] - part * y[step + 1, :6]
+        angles = -np.einsum("mai,mi->ma", gains[nearest], dx).clip(-LARGEST_TILT, LARGEST_TILT)
+        return turned(u[nearest], axes[nearest], angles)
+
+    return policy
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The rest of an ascent, from any state in any vehicle and air: one nonlinear program, built once
+# ---------------------------------------------------------------------------------------------------------------------
+
+CALM = (1.0, 0.0, 0.0)  # nominal air: the factor on the drag, the wind towards east and north in m/s
+
+
+class Rest(NamedTuple):
+    """What is left of an ascent. The arcs' columns are as `Rocket.arcs` has them, the mass that at their begin."""
+
+    begin: float  # s
+    state: np.ndarray  # (6,) r (m) and v (m/s) then
+    end: np.ndarray  # (A,) s, of the last arc the latest
+    thrust: np.ndarray  # (A,) N
+    flow: np.ndarray  # (A,) kg/s
+    mass: np.ndarray  # (A,) kg
+    h: np.ndarray  # (3,) m^2/s, angular momentum of the orbit to be reached
+    e: np.ndarray  # (3,) its eccentricity vector
+    air: tuple[float, float, float] = CALM
+
+
+@cache
+def rest_solver(rocket: Rocket, fixed: int, last: int):
+    """IPOPT for `fixed` intervals of known ends and `last` ones that share the last arc, of unknown duration.
+
+    The program is that of `rocket_baselines.ascent_program` with free final time, its numbers being parameters. The
+    rocket gives the Earth and the drag's area alone.
+    """
+    import casadi as ca
+
+    ca.GlobalOptions.setNumpyMode(1)  # as in ascent_program
+    n, points, scale = fixed + last, len(GAUSS_POINTS), ca.DM(state_scale(rocket))
+    x, z, u = ca.MX.sym("x", 6, n), ca.MX.sym("z", 6, n * points), ca.MX.sym("u", 3, n * points)
+    duration, start, engine = ca.MX.sym("duration"), ca.MX.sym("start", 6), ca.MX.sym("engine", 4, fixed)
+    burn, air, h, e = (ca.MX.sym(name, 3) for name in ("burn", "air", "h", "e"))
+    mass, thrust, flow = ca.vertsplit(burn)
+    dt, one = duration / last, ca.DM.ones(1, last)
+    rows = ca.vertcat(mass - flow * dt * ca.DM(range(last)).T, thrust * one, flow * one, dt * one)
+    parameters = ca.vertcat(ca.horzcat(engine, rows), ca.repmat(air, 1, n))
+    defects, ends = collocation(rocket, in_wind=True).map(n)(ca.horzcat(start, x[:, :-1]), z, u, parameters)
+    orbit = orbit_defect(rocket, scale * x[:, -1], h, e)
+    constraints = ca.veccat(defects, x - ends, ca.sum1(u**2) - 1, orbit, ca.sqrt(ca.sum1(x[:3, :] ** 2)))
+    program = {"x": ca.veccat(x, z, u, duration), "p": ca.veccat(start, engine, burn, air, h, e)}
+    program |= {"f": duration / (scale[0] / scale[3]), "g": constraints}
+    options = {"expand": True, "print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.tol": 1e-9}
+    options |= {"ipopt.max_iter": MAX_ITERATIONS}
+    return ca.nlpsol("rest", "ipopt", program, options)
+
+
+def rest_grid(rest: Rest, intervals, end: float):
+    """Ends of the intervals (n+1,) and times of the directions (n * points,), s, of a rest that lasts until `end`."""
+    edges = [rest.begin, *rest.end[:-1], end]
+    pieces = (np.linspace(a, b, k + 1)[1:] for a, b, k in zip(edges, edges[1:], intervals))
+    t = np.concatenate([[rest.begin], *pieces])
+    return t, (t[:-1, None] + np.diff(t)[:, None] * GAUSS_POINTS).ravel()
+
+
+def rest_parameters(rocket: Rocket, rest: Rest, intervals) -> np.ndarray:
+    """The parameters of `rest_solver` in its order."""
+    fixed = sum(intervals[:-1])
+    t, arc = rest_grid(rest, intervals, rest.end[-1])[0], np.repeat(np.arange(len(intervals)), intervals)
+    mass = rest.mass[arc] - rest.flow[arc] * (t[:-1] - np.append(rest.begin, rest.end)[arc])
+    engine = np.array([mass, rest.thrust[arc], rest.flow[arc], np.diff(t)])[:, :fixed]
+    start = rest.state / state_scale(rocket)
+    start[3] += 1e-16  # as in ascent_program
+    burn = rest.mass[-1], rest.thrust[-1], rest.flow[-1]
+    return np.concatenate([start, engine.T.ravel(), burn, rest.air, rest.h, rest.e])
+
+
+def optimise_rest(rocket: Rocket, rest: Rest, guess: dict, intervals: tuple[int, ...]) -> dict:
+    """The heaviest end of an ascent's rest, `intervals` of collocation in each of its arcs.
+
+    The guess has t (s), y (r, v), t_u (s), u, as has what is returned, with `final_time` (s) and `final_mass` (kg).
+    Raises NoOptimum where IPOPT finds none.
+    """
+    n, points, scale = sum(intervals), len(GAUSS_POINTS), state_scale(rocket)
+    solve, ignition = rest_solver(rocket, sum(intervals[:-1]), intervals[-1]), np.append(rest.begin, rest.end)[-2]
+    t, t_u = rest_grid(rest, intervals, guess["t"][-1])
+    states = interpolate(np.append(t[1:], t_u), guess["t"], guess["y"]) / scale
+    directions = interpolate(t_u, guess["t_u"], guess["u"])
+    w = np.concatenate([states.ravel(), directions.ravel(), [t[-1] - ignition]])
+    box = np.full(len(w) - 1, 2.0)  # as in ascend
+    equal, radius = np.zeros(n * (7 * points + 6) + 5), np.full(n, 1 + 1 / rocket.Re)
+    bounds = {"lbx": np.append(-box, 0.0), "ubx": np.append(box, rest.end[-1] - ignition)}
+    bounds |= {"lbg": np.append(equal, radius), "ubg": np.append(equal, np.full(n, np.inf))}
+    solution = solve(x0=w, p=rest_parameters(rocket, rest, intervals), **bounds)
+    status = solve.stats()["return_status"]
+    if status != "Solve_Succeeded":
+        raise NoOptimum(f"the rest of an ascent from {rest.begin} s: IPOPT stopped with {status}")
+    w = solution["x"].full()[:, 0]
+    end = ignition + w[-1]
+    t, t_u = rest_grid(rest, intervals, end)
+    times, states = np.append(t[1:], t_u), w[: 6 * n * (1 + points)].reshape(-1, 6) * scale
+    order = np.argsort(times)
+    found = {"t": np.append(rest.begin, times[order]), "y": np.vstack([rest.state, states[order]])}
+    found |= {"t_u": t_u, "u": w[6 * n * (1 + points) : -1].reshape(-1, 3), "status": status}
+    return found | {"final_time": end, "final_mass": rest.mass[-1] - rest.flow[-1] * w[-1]}
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Replanning: closed-loop explicit guidance
+# ---------------------------------------------------------------------------------------------------------------------
+
+REPLAN_EVERY = 20.0  # s
+LAST_REPLAN = 20.0  # s before the planned cut-off, after which the last plan is flown open loop
+REPLAN_INTERVALS = 8  # of collocation: 12 change the final mass by less than 1e-7 kg
+
+
+def optimum_guess(env_id: str) -> dict:
+    """The nominal optimum as a guess of `optimise_rest`."""
+    flight = nominal_optimum(env_id)
+    middle = (flight["t"][:-1] + flight["t"][1:]) / 2
+    return {"t": flight["t"], "y": flight["y"][:, :6], "t_u": middle, "u": flight["u"]}
+
+
+def held(plan: dict, times):
+    """A plan's directions (m, 3) at `times` (m,) in s, those at its end after it."""
+    from scipy.interpolate import CubicSpline
+
+    return CubicSpline(plan["t_u"], plan["u"])(np.minimum(times, plan["final_time"]))
+
+
+def replan_one(task):
+    """The plan of one flight, None where IPOPT finds none, and its seconds on one core; task: (rocket, rest, guess)."""
+    rocket, rest, guess = task
+    rest_solver(rocket, 0, REPLAN_INTERVALS)  # built before the clock runs
+    begin = time.process_time()
+    try:
+        plan = optimise_rest(rocket, rest, guess, (REPLAN_INTERVALS,))
+    except NoOptimum:
+        plan = None
+    return plan, time.process_time() - begin
+
+
+class Replan:
+    """What launchers do, as a policy: open loop until the last stage has been lit, then explicit guidance.
+
+    Every `REPLAN_EVERY` seconds the rest of the ascent is solved again, from the r, v observed and the flight
+    computer's mass, with the *nominal* thrust and flow, for the orbit of the target with the least propellant; its
+    directions are flown until the next plan, and after the last one, held, until the cut-off. A launcher also measures
+    its acceleration and corrects thrust and mass by it; this one does not. Where IPOPT fails, the last plan is kept.
+    On 60 draws of eval seed 1, others than the reported ones, p95 of ||error|| was 0.00012; replanned until 30 or 40 s
+    before the cut-off 0.00014 and 0.00026, every 10 s until 10 s 0.00004, every 4 s until 10 s 0.00002.
+
+    Solves are shared out to `processes`, which changes only the time. `failed` and `seconds` (one a solve) are counted
+    from its making on.
+    """
+
+    def __init__(self, env_id: str, processes: int = 1):
+        self.rocket, self.guess, self.replay = envs.ROCKETS[env_id].rocket, optimum_guess(env_id), replay(env_id)
+        self.middles = self.rocket.dt * (np.arange(np.ceil(self.rocket.end_time / self.rocket.dt)) + 0.5)
+        self.target = envs.target_orbit(self.rocket.target, self.rocket.mu)
+        self.failed, self.seconds = 0, []
+        self.processes, self.pool = processes, None
+        if processes > 1:
+            self.pool = ProcessPoolExecutor(processes, mp_context=get_context("spawn"))
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        if self.pool:
+            self.pool.shutdown()
+
+    def __call__(self, obs, t):
+        if t == 0:
+            self.plans = [self.guess] * len(obs)
+            self.u = np.stack([self.replay(obs, step) for step in range(len(self.middles))], axis=1)  # (m, steps, 3)
+        if t % round(REPLAN_EVERY / self.rocket.dt) == 0:
+            self.replan(obs, t)
+        return self.u[:, min(t, len(self.middles) - 1)]
+
+    def replan(self, obs, t):
+        """New plans from step t on for the flights of obs (m, 9) in the last burn that are not about to end it."""
+        rocket, now = self.rocket, self.rocket.dt * t
+        burn = rocket.burns[-1]
+        flow = burn.flow(rocket.table_isp)
+        lit = obs[:, 8] >= min(len(rocket.burns) - 1, 1)
+        who = [k for k in np.flatnonzero(lit) if self.plans[k]["t"][-1] - now > LAST_REPLAN]
+        tasks = []
+        for k in who:
+            latest = now + (obs[k, 6] - rocket.dry_mass) / flow
+            arc = (np.array([value]) for value in (latest, burn.thrust, flow, obs[k, 6]))
+            tasks.append((rocket, Rest(now, obs[k, :6], *arc, *self.target), self.plans[k]))
+        chunk = -(-len(tasks) // (2 * self.processes)) or 1
+        found = self.pool.map(replan_one, tasks, chunksize=chunk) if self.pool else map(replan_one, tasks)
+        for k, (plan, seconds) in zip(who, found):
+            self.seconds.append(seconds)
+            self.failed += plan is None
+            if plan:
+                self.plans[k], self.u[k, t:] = plan, held(plan, self.middles[t:])
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The bound: the optimum of each flight's own vehicle and air
+# ---------------------------------------------------------------------------------------------------------------------
+
+BOUND_SEGMENTS = 40  # of collocation: the nominal optimum's mass is then within 1e-4 kg of 80
+
+
+def drawn_rest(rocket: Rocket, dispersion: float, z, orbit) -> Rest:
+    """All of the ascent of the vehicle and air drawn by z (k,), to the orbit (h, e)."""
+    vehicle = envs.draw_vehicles(rocket, dispersion, np.asarray(z)[None])
+    end = np.append(vehicle.end[: len(rocket.burns) - 1, 0], vehicle.burn_out)
+    thrust, flow, dropped = (column[: len(end), 0] for column in (vehicle.thrust, vehicle.flow, vehicle.dropped))
+    lost = flow * np.diff(end, prepend=0.0) + dropped
+    mass = vehicle.mass[0] - np.append(0.0, np.cumsum(lost)[:-1])
+    air = (vehicle.drag[0], *vehicle.wind[:, 0])
+    return Rest(0.0, rocket.x0[:6], end, thrust, flow, mass, *orbit, air)
+
+
+def bound_one(task):
+    """The optimum of one flight, None where IPOPT finds none: task is (rocket, dispersion, z, orbit, guess)."""
+    rocket, dispersion, z, orbit, guess = task
+    ends = np.append([burn.end for burn in rocket.burns[:-1]], guess["t"][-1])
+    parts = np.diff(ends, prepend=0.0) / ends[-1]
+    intervals = tuple(max(round(BOUND_SEGMENTS * part), 1) for part in parts)
+    try:
+        return optimise_rest(rocket, drawn_rest(rocket, dispersion, z, orbit), guess, intervals)
+    except NoOptimum:
+        return None
+
+
+def drawn_optima(env_id: str, dispersion: float, z, reached=None, processes: int = 1) -> list:
+    """The optima that know their draws z (n, k): what `optimise_rest` returns, None where IPOPT finds none.
+
+    To the target, or to the orbits of the states `reached` (n, 6 or more). What is left of the mass is a bound for
+    every law that ends on that orbit, whatever it knows.
+    """
+    rocket, guess = envs.ROCKETS[env_id].rocket, optimum_guess(env_id)
+    orbits = [envs.target_orbit(rocket.target, rocket.mu)] * len(z)
+    if reached is not None:
+        orbits = [tuple(np.array(vector) for vector in envs.orbit_vectors(y, rocket.mu)) for y in reached]
+    tasks = [(rocket, dispersion, row, orbit, guess) for row, orbit in zip(z, orbits)]
+    if processes == 1:
+        return [bound_one(task) for task in tasks]
+    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
+        return list(pool.map(bound_one, tasks, chunksize=-(-len(tasks) // (4 * processes))))
+
+
+def fly_optima(env_id: str, optima: list):
+    """The law that flies each of the m flights by its own optimum, open loop, and the nominal one where that is None.
+
+    It knows the draw: it is flown to see that the bound can be reached.
+    """
+    rocket, nominal = envs.ROCKETS[env_id].rocket, replay(env_id)
+    middles = rocket.dt * (np.arange(np.ceil(rocket.end_time / rocket.dt)) + 0.5)
+    u = [held(optimum, middles) if optimum else None for optimum in optima]
+
+    def policy(obs, t):
+        actions = nominal(obs, t)
+        for k, directions in enumerate(u):
+            if directions is not None:
+                actions[k] = directions[min(t, len(middles) - 1)]
+        return actions
+
+    return policy

@@ -1,0 +1,302 @@
+"""The opponents against the environment, SciPy and least squares; the comparison's command against bad input."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rocket_oracle import CUTOFF, LEO, PAPER
+
+import comparison
+import envs
+import evaluate
+import opponents
+from envs import ROCKET, ROCKETS
+from rocket_baselines import NoOptimum, rocket_reference
+
+ROOT = Path(__file__).parents[1]
+SHIPPED = ROOT / "results" / "rocket_cutoff"
+SCORES = len(envs.DRAW)
+
+
+def ends(law, z, env_id=CUTOFF):
+    """The ends of flights with the draws z (m, k) at dispersion 1."""
+    return evaluate.fly_dispersed(env_id, law, np.asarray(z), 1.0)
+
+
+# --- open loop and LQR ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("env_id", [CUTOFF, LEO])
+def test_without_a_difference_every_law_of_the_optimum_reaches_the_target(env_id):
+    z = np.zeros((1, len(envs.draw_names(ROCKETS[env_id].rocket))))
+    for law in (opponents.replay(env_id), opponents.tvlqr(env_id), opponents.tvlqr(env_id, by_energy=True)):
+        assert ends(law, z, env_id)["error_norm"][0] < 2e-4
+
+
+@pytest.fixture(scope="module")
+def linear():
+    """The optimum, its steering axes, A (K, 6, 6) and B (K, 6, 2)."""
+    flight = rocket_reference(CUTOFF)
+    axes = opponents.normal_axes(flight["u"])
+    return flight, axes, *opponents.linearise_flight(ROCKETS[CUTOFF], flight, axes)
+
+
+@pytest.mark.parametrize("k", [3, 37, 75, 130, 300, 461])  # 37 to 130: steps with a staging; 462 is the last
+def test_linearised_steps_are_scipys(linear, k):
+    """Central differences of SciPy's integration between the stagings, with other differences and other axes."""
+    flight, axes, A, B = linear
+    begin, end, y, u = flight["t"][k], flight["t"][k + 1], flight["y"][k], flight["u"][k]
+
+    def step(dx, du):
+        w = u + du
+        return PAPER.integrate(y + np.append(dx, 0.0), begin, end, w / np.linalg.norm(w))[:6]
+
+    for j, h in enumerate(np.repeat([200.0, 0.2], 3)):
+        column = (step(h * np.eye(6)[j], 0.0) - step(-h * np.eye(6)[j], 0.0)) / (2 * h)
+        np.testing.assert_allclose(A[k, :, j], column, rtol=2e-4, atol=2e-6)
+    np.testing.assert_allclose(axes[k] @ axes[k].T, np.eye(2), atol=1e-14)
+    np.testing.assert_allclose(axes[k] @ u, 0.0, atol=1e-14)
+    for j in range(2):
+        column = (step(np.zeros(6), 1e-3 * axes[k, j]) - step(np.zeros(6), -1e-3 * axes[k, j])) / 2e-3
+        np.testing.assert_allclose(B[k, :, j], column, rtol=1e-4, atol=1e-4 * np.abs(column).max())
+
+
+def test_gains_are_the_least_squares_of_the_last_steps(linear):
+    """From step K - 12 on: the angles that minimise |C x_K|^2 + R dt |angles|^2, all at once, without a recursion."""
+    flight, _, A, B = linear
+    gains, _ = opponents.lqr_gains(ROCKETS[CUTOFF], flight)
+    K, first, dt = len(A), len(A) - 12, np.diff(flight["t"])
+    rate = (flight["y"][-1] - flight["y"][-2])[:6] / dt[-1]
+    C = opponents.cutoff_jacobian(ROCKET, flight["y"][-1], rate)
+    ahead, columns = np.eye(6), []
+    for k in reversed(range(first, K)):
+        columns.insert(0, C @ ahead @ B[k])
+        ahead = ahead @ A[k]
+    weights = np.sqrt(opponents.STEERING_WEIGHT * np.repeat(dt[first:], 2))
+    system = np.vstack([np.hstack(columns), np.diag(weights)])
+    best = np.linalg.lstsq(system, np.vstack([-C @ ahead, np.zeros((24, 6))]), rcond=1e-15)[0][:2]
+    np.testing.assert_allclose(-gains[first], best, rtol=1e-5, atol=1e-7 * np.abs(best).max())
+
+
+def test_what_is_along_the_trajectory_costs_nothing():
+    """And what keeps the energy costs its terminal error."""
+    y = rocket_reference(CUTOFF)["y"][-1]
+    rate = np.append(y[3:6], -ROCKET.mu * y[:3] / np.linalg.norm(y[:3]) ** 3 + 14.0 * y[3:6] / np.linalg.norm(y[3:6]))
+    C = opponents.cutoff_jacobian(ROCKET, y, rate)
+    beside = np.append([30.0, -20.0, 10.0], [0.02, 0.01, -0.03])
+    assert np.linalg.norm(C @ rate) < 1e-9 < 1e-6 < np.linalg.norm(C @ beside)
+    moved = y[:6] + beside
+    kinetic = ROCKET.target_energy + ROCKET.mu / np.linalg.norm(moved[:3])  # at the target's energy
+    moved[3:] *= np.sqrt(2 * kinetic) / np.linalg.norm(moved[3:])
+    at = y[:6].copy()
+    at[3:] *= np.sqrt(2 * (ROCKET.target_energy + ROCKET.mu / np.linalg.norm(at[:3]))) / np.linalg.norm(at[3:])
+    miss = envs.terminal_error(moved, ROCKET) - envs.terminal_error(at, ROCKET)
+    np.testing.assert_allclose(C @ (moved - at), miss, atol=2e-4 * np.linalg.norm(miss))
+
+
+def test_feedback_is_worth_something():
+    """On the same eight draws the LQR ends closer than the replay; by energy closer still."""
+    z = evaluate.draws(ROCKET, 1.0, 5, 8)
+    laws = opponents.replay(CUTOFF), opponents.tvlqr(CUTOFF), opponents.tvlqr(CUTOFF, by_energy=True)
+    open_loop, by_time, by_energy = (ends(law, z)["error_norm"] for law in laws)
+    assert (by_time < open_loop / 2).all() and by_time.max() < 2e-3
+    assert by_energy.max() < 5e-4 and np.median(by_energy) < np.median(by_time)
+
+
+def test_by_energy_a_late_flight_is_no_other_flight():
+    """Where the optimum was, some steps later: the optimum's direction; by time it is behind, and turned."""
+    flight = rocket_reference(CUTOFF)
+    places = np.array([150, 300, 450])
+    obs = np.column_stack([flight["y"][places], np.zeros(3), np.ones(3)])
+    by_time, by_energy = (opponents.tvlqr(CUTOFF, by_energy=choice)(obs, 140) for choice in (False, True))
+    np.testing.assert_allclose(by_energy, flight["u"][places], atol=1e-9)
+    assert (np.linalg.norm(by_time - flight["u"][places], axis=1) > 0.01).all()
+
+
+# --- what solves ------------------------------------------------------------------------------------------------------
+
+
+def test_replanning_the_nominal_flight_loses_nothing():
+    law = opponents.Replan(CUTOFF)
+    flown = ends(law, np.zeros((1, SCORES)))
+    assert len(law.seconds) >= 30 and law.failed == 0
+    assert flown["error_norm"][0] < 2e-5
+    # a direction that is held for 2 s costs 0.06 kg
+    assert flown["final_mass_kg"][0] == pytest.approx(rocket_reference(CUTOFF)["reference_mass_kg"], abs=0.1)
+
+
+def test_replanning_meets_what_the_replay_misses(monkeypatch):
+    """A flight with less thrust and more drag; the plans are for the vehicle that the law believes in."""
+    monkeypatch.setattr(opponents, "REPLAN_EVERY", 100.0)
+    z = np.zeros((1, SCORES))
+    z[0, [2, 5, SCORES - 3]] = -2.0, -2.0, 2.0
+    seen, solve = [], opponents.optimise_rest
+
+    def spy(rocket, rest, guess, intervals):
+        seen.append((rest.begin, rest.thrust[0], rest.flow[0], rest.air))
+        return solve(rocket, rest, guess, intervals)
+
+    monkeypatch.setattr(opponents, "optimise_rest", spy)
+    assert (
+        ends(opponents.Replan(CUTOFF), z)["error_norm"][0]
+        < 2e-3
+        < 5e-3
+        < ends(opponents.replay(CUTOFF), z)["error_norm"][0]
+    )
+    assert [begin for begin, *_ in seen] == [300.0, 400.0, 500.0, 600.0, 700.0, 800.0, 900.0]
+    assert {what for _, *what in map(tuple, seen) for what in [tuple(what)]} == {
+        (110094.0, 16820 / 700, (1.0, 0.0, 0.0))
+    }
+
+
+def test_a_failed_solve_keeps_the_last_plan(monkeypatch):
+    def fail(*_):
+        raise NoOptimum("none")
+
+    monkeypatch.setattr(opponents, "optimise_rest", fail)
+    z, law = evaluate.draws(ROCKET, 1.0, 5, 2), opponents.Replan(CUTOFF)
+    np.testing.assert_array_equal(ends(law, z)["final_y"], ends(opponents.replay(CUTOFF), z)["final_y"])
+    assert law.failed == len(law.seconds) > 50
+
+
+def test_the_optimum_that_knows_nothing_differs_is_the_reference():
+    (optimum,) = opponents.drawn_optima(CUTOFF, 1.0, np.zeros((1, SCORES)))
+    reference = rocket_reference(CUTOFF)
+    assert optimum["final_mass"] == pytest.approx(reference["reference_mass_kg"], abs=1e-4)
+    assert optimum["final_time"] == pytest.approx(reference["reference_time_s"], abs=1e-4)
+
+
+@pytest.mark.parametrize("env_id", [CUTOFF, LEO])
+def test_the_optimum_of_a_draw_is_flown_by_the_environment(env_id):
+    """To the target, with its mass; another flight's optimum misses: thrust, staging, drag and wind are the draw's."""
+    z = evaluate.draws(ROCKETS[env_id].rocket, 1.0, 5, 2)
+    optima = opponents.drawn_optima(env_id, 1.0, z)
+    own, other = (ends(opponents.fly_optima(env_id, plans), z, env_id) for plans in (optima, optima[::-1]))
+    assert own["error_norm"].max() < 2e-4 < 1e-3 < other["error_norm"].min()
+    np.testing.assert_allclose(own["final_mass_kg"], [optimum["final_mass"] for optimum in optima], rtol=2e-5)
+
+
+def test_to_the_orbit_reached_the_bound_holds():
+    """A replay that misses is lighter than the optimum of its own draw and orbit, heavier perhaps than the target's."""
+    z = evaluate.draws(ROCKET, 1.0, 5, 3)
+    flown = ends(opponents.replay(CUTOFF), z)
+    optima = opponents.drawn_optima(CUTOFF, 1.0, z, flown["final_y"])
+    for optimum, y in zip(optima, flown["final_y"]):
+        assert 0.998 < y[6] / optimum["final_mass"] < 1
+        reached, planned = (envs.orbital_elements(state) for state in (y, optimum["y"][-1]))
+        np.testing.assert_allclose(planned, reached, rtol=1e-7)
+
+
+# --- comparison -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("law", ["replay", "down"])
+def test_recorded_flights_give_the_metrics_again(law):
+    policy = opponents.replay(CUTOFF) if law == "replay" else lambda obs, t: -obs[:, :3]
+    metrics, arrays = evaluate.evaluate_dispersed(CUTOFF, policy, 4, 12, 6.0)
+    flights = comparison.recorded_flights(arrays, ROCKET, 6.0)
+    again = evaluate.dispersed_metrics(flights, ROCKET)
+    assert again.keys() == metrics.keys() - {"dispersion", "dispersed_starts"}
+    assert all(again[key] == pytest.approx(metrics[key], rel=1e-12) for key in again)
+    assert metrics["dispersed_crashed"] == (12 if law == "down" else 0)
+
+
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory):
+    """The command on a copy of the shipped results, with few solves in this process: its folder and what it printed."""
+    folder = shutil.copytree(
+        SHIPPED, tmp_path_factory.mktemp("results") / "rocket", ignore=shutil.ignore_patterns("*.gif")
+    )
+
+    def fly_checkpoint(path, dispersion, eval_seed, n):
+        """What a policy's process would give, without torch."""
+        _, arrays = evaluate.evaluate_dispersed(CUTOFF, opponents.replay(CUTOFF), eval_seed, n, dispersion)
+        return arrays, {"knows": comparison.knowledge({"dispersion": 1.0, "observe_draw": True}), "decision_us": 7.0}
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(opponents, "REPLAN_EVERY", 200.0)
+        patch.setattr(opponents, "BOUND_SEGMENTS", 8)
+        patch.setattr(comparison, "PROCESSES", 1)
+        patch.setattr(comparison, "fly_checkpoint", fly_checkpoint)
+        made, keep = [], comparison.Comparison.__init__
+        patch.setattr(comparison.Comparison, "__init__", lambda self, *a: made.append(self) or keep(self, *a))
+        comparison.run(folder, 1.0, 6, 3, 3, [("again", folder / "agent.safetensors")])
+    return folder, made[0]
+
+
+def test_all_laws_fly_the_same_draws(compared):
+    _, flown = compared
+    z = evaluate.draws(ROCKET, 1.0, 3, 6)
+    assert set(flown.arrays) == {"policy", "again", *comparison.KNOWLEDGE}
+    for name, arrays in flown.arrays.items():
+        n = 3 if name in ("replan", "optimum") else 6
+        np.testing.assert_array_equal(arrays["draw"], z[:n])
+
+
+def test_report(compared):
+    folder, flown = compared
+    report = json.loads((folder / "opponents.json").read_text())
+    for name, law in report["laws"].items():
+        errors = np.linalg.norm(flown.arrays[name]["final_error"], axis=1)
+        assert law["dispersed_starts"] == len(errors) and law["first"]["dispersed_starts"] == 3
+        assert law["dispersed_error_max"] == errors.max() and law["first"]["dispersed_error_max"] == errors[:3].max()
+        assert law["share_reached_flights"] <= 3 and law.get("share_reached_mean", 0.9) < 1.0001
+    laws = report["laws"]
+    assert laws["policy"]["knows"] == "draws in training, the draw itself"
+    assert laws["optimum"]["share_target_mean"] == pytest.approx(1, abs=1e-4)
+    masses = [optimum["final_mass"] for optimum in flown.optima]
+    share = flown.arrays["tvlqr"]["final_y"][:3, 6] / masses
+    assert laws["tvlqr"]["share_target_mean"] == pytest.approx(share.mean())
+    assert laws["replan"]["solves"] == 9 and laws["replan"]["decision_us"] > 1000 > laws["replay"]["decision_us"] > 0
+    lines = comparison.table(report).splitlines()
+    assert len(lines) == 2 + 7 + 5 + 3 and "replan: " in lines[-1]
+    (line,) = [line for line in lines if line.startswith("  tvlqr  ")]
+    assert f"{laws['tvlqr']['dispersed_error_median']:.6f}" in line and f"{share.mean():.3%}" in line
+    assert (folder / "figures" / "opponents.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    "argv, line",
+    [
+        (["{missing}"], "No such file"),
+        (["{fixed}"], "the env_id of .* is RocketAscent-v0; it must be a rocket's with cut-off"),
+        (["{di}"], "the env_id of .* is DoubleIntegrator-v0; it must be a rocket's with cut-off"),
+        (["{good}", "--starts=9"], "'9' must be a whole number from 10 to 100000"),
+        (["{good}", "--starts=20", "--solved=21"], "--solved is 21; it must be at most 20"),
+        (["{good}", "--solved=342"], "--solved is 342; it must be at most 341"),
+        (["{good}", "--dispersion=0"], "'0' must be a number above 0, at most 10"),
+        (["{good}", "--dispersion=nan"], "'nan' must be a number above 0, at most 10"),
+        (["{good}", "--eval-seed=-1"], "'-1' must be a whole number"),
+        (["{good}", "--also", "mine"], "'mine' must be NAME=PATH"),
+        (
+            ["{good}", "--also", "replan={good}/agent.safetensors"],
+            "the NAME of --also is replan; it must be that of no",
+        ),
+        (["{good}", "--also", "mine={missing}"], "No such file"),
+        (["{good}", "--also", "mine={good}/eval.json"], "damaged or foreign"),
+        (["{good}", "--also", "mine={di}/agent.safetensors"], f"is DoubleIntegrator-v0; it must be {CUTOFF}"),
+    ],
+)
+def test_bad_input_is_one_line_and_changes_nothing(tmp_path, monkeypatch, argv, line):
+    monkeypatch.setattr(comparison, "Comparison", None)  # nothing is flown
+    for name in ("rocket_cutoff", "rocket_fixed", "di"):
+        shutil.copytree(ROOT / "results" / name, tmp_path / name, ignore=shutil.ignore_patterns("figures"))
+    places = {"good": "rocket_cutoff", "fixed": "rocket_fixed", "di": "di", "missing": "nowhere"}
+    argv = [word.format(**{key: tmp_path / name for key, name in places.items()}) for word in argv]
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    monkeypatch.setattr("sys.argv", ["evaluate.py", "opponents", *argv])
+    with pytest.raises(SystemExit, match=line) as refusal:
+        evaluate.main()
+    assert "\n" not in str(refusal.value)
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
+def test_a_script_that_refuses_is_said_in_its_own_line(tmp_path):
+    """A policy with another network than its file says."""
+    broken = tmp_path / "agent.safetensors"
+    data = (SHIPPED / "agent.safetensors").read_bytes().replace(b'\\"embed_dim\\": 64', b'\\"embed_dim\\": 32')
+    broken.write_bytes(data)
+    with pytest.raises(envs.BadInput, match=f"^{broken}: error: --checkpoint .* does not fit its own args"):
+        comparison.fly_checkpoint(broken, 1.0, 0, 10)
