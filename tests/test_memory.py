@@ -1,0 +1,100 @@
+"""`benchmarks/attention.py` and `benchmarks/memory.py`: the weights against the network's own output, the tables."""
+
+import json
+import shlex
+import sys
+from pathlib import Path
+
+import attention
+import memory
+import numpy as np
+import pytest
+import run_seeds
+import torch
+from matplotlib.image import imread
+
+import evaluate
+import ppo_gtrxl_di as script
+
+ROOT = Path(__file__).parent.parent
+torch.set_num_threads(1)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("L", [0, 5, 40])
+def test_weights_are_the_networks(L):
+    """Put to work on the values, they give what the attention itself gives; before the start stands the memory."""
+    args = script.Args(embed_dim=8, num_heads=2, mlp_dim=8, hidden_dim=8, num_blocks=2, memory_length=L)
+    torch.manual_seed(1)
+    agent = script.Agent(args, evaluate.envs.gym.make_vec(args.env_id, num_envs=1)).double()
+    for block in agent.blocks:
+        block.attention.R.normal_()
+    obs = np.random.default_rng(0).uniform(-3, 3, (23, 3))
+    found = attention.weights(agent, obs)
+    assert found.shape == (2, 2, 23, L + 1)
+    np.testing.assert_allclose(found.sum(axis=-1), 1.0, rtol=1e-12)
+    assert L == 0 or found.std(axis=-1).mean() > 0.01
+    passes = []
+    for block in agent.blocks:
+        block.attention.register_forward_hook(lambda _, given, out: passes.append((*given, out)))
+    agent.encode(torch.as_tensor(obs)[None], agent.new_memory(1, noise=0.0))
+    for block, (x, before, out), weights in zip(agent.blocks, passes, found):
+        values = block.attention.value(torch.cat([before[0], x[0]])).unflatten(-1, (2, 4)).numpy()
+        attended = np.zeros((23, 2, 4))
+        for i in range(23):
+            for back in range(L + 1):
+                attended[i] += weights[:, i, back, None] * values[L + i - back]
+        expected = attended.reshape(23, 8) @ block.attention.out.weight.numpy().T
+        np.testing.assert_allclose(out[0].numpy(), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("name, heads", [("vdp_waypoints", 6), ("rocket_cutoff", 8)])
+def test_attention_of_a_shipped_policy(name, heads, tmp_path, monkeypatch, capsys):
+    path = tmp_path / "attention.png"
+    monkeypatch.setattr(sys, "argv", ["attention.py", str(ROOT / "results" / name), str(path)])
+    attention.main()
+    printed = capsys.readouterr().out
+    assert printed.count("head") == heads and "after an event" in printed and imread(path).std() > 0.05
+
+
+def evaluations(folder, values):
+    for seed, value in enumerate(values, start=1):
+        (folder / "seeds").mkdir(parents=True, exist_ok=True)
+        metrics = {"env_id": "DoubleIntegrator-v0", "seed": seed, "ratio_of_sums": value, "hit_rate": 1.0}
+        (folder / "seeds" / f"{seed}.json").write_text(json.dumps(metrics))
+
+
+def test_table_and_figure_of_what_is_there(tmp_path, monkeypatch, capsys):
+    evaluations(tmp_path / "hidden_velocity" / "memory_4", [1.5, 1.25, 3.0])
+    evaluations(tmp_path / "hidden_velocity" / "shown", [1.005])
+    monkeypatch.setattr(sys, "argv", ["memory.py", str(tmp_path)])
+    memory.main()
+    title, header, *rows = capsys.readouterr().out.splitlines()
+    assert "velocity hidden" in title and header.split()[:2] == ["seeds", "ratio"]
+    assert rows[0].split("  ")[1:] and "L_mem 4" in rows[0] and "1.5 (1.25 to 3)" in rows[0] and " 3 " in rows[0]
+    assert "velocity shown" in rows[1] and "1.005" in rows[1] and "-" in rows[1] and len(rows) == 2
+    assert imread(tmp_path / "memory.png").std() > 0.05
+
+
+def test_an_empty_folder_is_one_line(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["memory.py", str(tmp_path)])
+    with pytest.raises(SystemExit, match="error: .* has no finished run"):
+        memory.main()
+
+
+def test_every_row_of_the_tables_has_its_three_jobs():
+    """Seeds 1 to 3 of each, by one command that differs from its neighbours by what the row says alone."""
+    jobs = run_seeds.read_jobs(ROOT / "benchmarks" / "memory_jobs.txt")
+    for name, experiment in memory.EXPERIMENTS.items():
+        for row in experiment.rows:
+            seeds = [job.args["seed"] for job in jobs if job.results == Path("results/memory", name, row)]
+            assert sorted(seeds) == [1, 2, 3], (name, row)
+    assert len(jobs) == sum(3 * len(experiment.rows) for experiment in memory.EXPERIMENTS.values())
+    hidden = {"rocket": None, "hidden_phase": "observe_phase", "hidden_velocity": "observe_velocity"}
+    for job in jobs:
+        _, _, name, row = job.results.parts
+        if row.startswith("memory_"):
+            assert job.args["memory_length"] == int(row.removeprefix("memory_"))
+        if hidden[name]:
+            assert job.args[hidden[name]] == (row == "shown"), shlex.join(job.command)
+    assert all(job.args["num_blocks"] == 0 for job in jobs if job.results.name == "mlp")
