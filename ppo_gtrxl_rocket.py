@@ -101,17 +101,26 @@ ENV_IDS = tuple(ROCKETS)
 ENV_OPTIONS = ("observe_phase", "action_frame", "dispersion", "observe_draw", "observe_mass")  # of the environments
 
 
+# sizes by which flights at dispersion 1 differ at the same step: altitude 3 km, climb rate 15 m/s, position and speed
+# out of the plane 0.5 km and 1.5 m/s, speed 30 m/s, the logarithm of the observed mass, angle flown 6 km of arc
+DIFFERENCES = [0.03, 0.015, 0.005, 0.0015, 0.004, 0.003, 0.001]
+
+
 def constants(rocket):
-    """What `features` reads as agent.<name> for a rocket; saved with the weights."""
+    """What `features` reads as agent.<name> for a rocket; saved with the weights. Only `mean_flight` is learnt."""
     axes = target_axes(rocket)  # rows: directions of perigee and semi-latus rectum, plane normal
     h_target, e_target = target_orbit(rocket.target, rocket.mu)  # angular momentum and eccentricity vector
     length, speed = rocket.Re, (rocket.mu / rocket.Re) ** 0.5  # units in which mu = 1: 6378 km and 7.9 km/s
+    steps = rocket.end_time / rocket.dt
     return {
         "axes": axes.tolist(),
         "units": [length] * 3 + [speed] * 3 + [rocket.dry_mass],
         "h_target": (axes @ h_target / (length * speed)).tolist(),
         "e_target": (axes @ e_target).tolist(),
         "phases": np.linspace(0.0, 1.0, len(rocket.burns)).tolist(),
+        "steps": steps,
+        "differences": DIFFERENCES,
+        "mean_flight": np.zeros((math.ceil(steps) + 1, len(DIFFERENCES))).tolist(),
     }
 
 
@@ -119,28 +128,61 @@ BUFFERS = {env_id: constants(mission.rocket) for env_id, mission in ROCKETS.item
 INITIAL_ACTION = [1.0, 0.0, 0.0]  # straight up: a randomly steered rocket never leaves the ground
 
 
-def features(agent, obs):
-    """What the encoder sees of observations (..., 9 or more): the state in the target orbit's axes, and its error.
-
-    h = r x v, e = v x h - r / |r| (mu = 1), error = [(h - h_T) / |h_T|, e - e_T], given raw and as tanh(10 error), so
-    that small ones are seen. Frame, scales and tanh are ours: the paper gives the state alone.
-    """
+def motion(agent, obs):
+    """Position and velocity (..., 3) in the target's axes and units, and what flights are compared by (..., 7)."""
     r, v, mass = (obs[..., :7] / agent.units).split([3, 3, 1], dim=-1)
-    t_norm, phase = obs[..., 7:8], obs[..., 8:9]  # phase: 0 to 1, one of agent.phases (the paper's 0 to 3)
     r = r @ agent.axes.T  # towards the perigee, along the semi-latus rectum, normal to the plane
     v = v @ agent.axes.T
     radius = r.norm(dim=-1, keepdim=True)
-    h = torch.linalg.cross(r, v)
-    e = torch.linalg.cross(v, h) - r / radius
-    error = torch.cat([(h - agent.h_target) / agent.h_target.norm(), e - agent.e_target], dim=-1)
     altitude = 64 * (radius - 1)  # 64: the unit of length in 100 km
     radial_velocity = 8 * ((r * v).sum(dim=-1, keepdim=True) / radius)  # 8: the unit of speed in km/s
     out_of_plane = [64 * r[..., 2:], 8 * v[..., 2:]]
     speed = v.norm(dim=-1, keepdim=True)
+    angle = torch.atan2(r[..., 1:2], r[..., :1])
+    return r, v, torch.cat([altitude, radial_velocity, *out_of_plane, speed, mass.log(), angle], dim=-1)
+
+
+def features(agent, obs):
+    """What the encoder sees of observations (..., 9 or more): the state in the target orbit's axes, and its error.
+
+    h = r x v, e = v x h - r / |r| (mu = 1), error = [(h - h_T) / |h_T|, e - e_T], given raw and as tanh(10 error), so
+    that small ones are seen. Last, what this flight differs by from the mean of all at the same step: beside the 200 km
+    that each climbs, the few that tell one dispersed flight from another would not be seen. Frame, scales and tanh are
+    ours: the paper gives the state alone.
+    """
+    r, v, compared = motion(agent, obs)
+    t_norm, phase = obs[..., 7:8], obs[..., 8:9]  # phase: 0 to 1, one of agent.phases (the paper's 0 to 3)
+    h = torch.linalg.cross(r, v)
+    e = torch.linalg.cross(v, h) - r / r.norm(dim=-1, keepdim=True)
+    error = torch.cat([(h - agent.h_target) / agent.h_target.norm(), e - agent.e_target], dim=-1)
     phases = ((phase - agent.phases).abs() < 1e-3).to(obs.dtype)  # one-hot
-    state = [r, v, altitude, radial_velocity, *out_of_plane, speed, t_norm, mass.log(), phases]
+    state = [r, v, compared[..., :5], t_norm, compared[..., 5:6], phases]
     draw = obs[..., 9:]  # with --observe-draw
-    return torch.cat([*state, error, (10 * error).tanh(), draw], dim=-1)
+    step = ((1 - t_norm[..., 0]) * agent.steps).round().long().clamp(max=len(agent.mean_flight) - 1)
+    mean_flight = agent.mean_flight[step]
+    known = mean_flight.any(dim=-1, keepdim=True)  # zeros until there has been a flight to compare with
+    differs = known * ((compared - mean_flight) / agent.differences).tanh()
+    return torch.cat([*state, error, (10 * error).tanh(), draw, differs], dim=-1)
+
+
+@torch.no_grad()
+def learn_buffers(agent, args, batch):
+    """Move `mean_flight` a tenth of the way to the mean of the flights of an update, if they are dispersed.
+
+    At first all the way; what then comes into the encoder's sight has no weight yet, so that it changes nothing. Steps
+    to which less than a quarter of the flights live are left alone.
+    """
+    if not args.dispersion:
+        return
+    if not agent.mean_flight.any():
+        agent.encoder[0].weight[:, -len(DIFFERENCES) :] = 0.0
+    rows = agent.mean_flight[: len(batch.obs)]  # a view
+    alive = batch.alive[: len(rows)]
+    _, _, compared = motion(agent, batch.obs[: len(rows)])
+    mean, _ = moments(compared, alive[..., None], 1)
+    share = total(alive.sum(1)) / total(torch.ones_like(alive).sum(1))
+    rate = torch.where(rows.any(dim=1), 0.1, 1.0) * (share >= 0.25)
+    rows += rate[:, None] * (mean[:, 0] - rows)
 
 
 def mean_action(output, action_scale):
@@ -152,14 +194,11 @@ def set_curriculum(envs, args, progress, refines, std):
     """What only training changes, all of it ours; returns how many flights in a row have the same start: any number.
 
     Noise std scatters the ends of the flights by about std / 10: R_terminal need not be steeper; dispersed ones end
-    some 0.001 apart whatever the noise. What differs between them is hidden by the noise for most of a run: once the
-    orbit is nearly reached, they differ by up to four times as much, by less as the noise falls, so that they teach the
-    policy to steer against it. Precision comes first, so that burning costs nothing in the first quarter of the
-    updates, and --mass-weight from 60 % on.
+    some 0.001 apart whatever the noise. Precision comes first, so that burning costs nothing in the first quarter of
+    the updates, and --mass-weight from 60 % on.
     """
     envs.guidance = args.guidance
     envs.terminal_scale = min(TERMINAL_SCALE, max(std / 8, 0.001 if args.dispersion else 0.0))
-    envs.draw_scale = np.clip(std / 0.016, 1.0, 4.0) if progress > 0.15 else 1.0
     ramp = np.clip((progress - 0.25) / (0.60 - 0.25), 0.0, 1.0)
     envs.mass_weight = float(envs.cutoff * args.mass_weight * ramp)
     return args.flights_per_start
@@ -559,6 +598,8 @@ def train(args, agent, average, optimizer, envs, run):
         means = {name: torch.stack([logged[name] for logged in log]).mean().item() for name in losses}
         means["explained_variance"] = explained_variance(batch.values, batch.returns, batch.alive)
         means["baseline_explained_variance"] = explained_variance(baseline, returns, batch.alive)
+
+        learn_buffers(agent, args, batch)
 
         # the noise of the next update: linear to its last value, from wherever it is
         falls = {"learned": refines, "schedule": True, "gated": precise_enough(episodes, std)}

@@ -392,22 +392,21 @@ def draw_sigmas(rocket: Rocket) -> np.ndarray:
     return np.array([table[name if name in table else name.rpartition("_")[0]] for name in draw_names(rocket)])
 
 
-def draw_bounds(rocket: Rocket, dispersion: float, scale: float = 1.0) -> np.ndarray:
-    """(k,): the largest score that is drawn: 3 times `scale`, less where a factor or the payload would change by more
-    than 90 %."""
+def draw_bounds(rocket: Rocket, dispersion: float) -> np.ndarray:
+    """(k,): the largest score that is drawn: 3, less where a factor or the payload would change by more than 90 %."""
     nominal = np.ones(len(draw_names(rocket)))
     nominal[-4:] = rocket.payload, 1.0, np.inf, np.inf
     sigmas = dispersion * draw_sigmas(rocket)
-    bounds = np.full(len(nominal), scale * LARGEST_SCORE)
+    bounds = np.full(len(nominal), LARGEST_SCORE)
     return np.minimum(bounds, np.divide(LARGEST_CHANGE * nominal, sigmas, out=bounds.copy(), where=sigmas > 0))
 
 
-def largest_draw(rocket: Rocket, dispersion: float, scale: float = 1.0) -> np.ndarray:
-    """(1, k): the draw within `draw_bounds` of the vehicle that burns longest and is heaviest."""
+def largest_draw(rocket: Rocket, dispersion: float) -> np.ndarray:
+    """(1, k): the draw of the vehicle that burns longest and is heaviest."""
     types = len(engine_types(rocket))
     signs = np.zeros(len(draw_names(rocket)))
     signs[:types], signs[2 * types : 4 * types + 1] = -1.0, 1.0
-    return (signs * draw_bounds(rocket, dispersion, scale))[None]
+    return (signs * draw_bounds(rocket, dispersion))[None]
 
 
 def engine_groups(rocket: Rocket) -> tuple[Group, ...]:

@@ -77,9 +77,8 @@ class RocketVectorEnv(BatchedEnv):
     `episodic_return`, `points` (`precision_points`), `crashed`; with dispersion `draw` (N, k) and `dry`, out of fuel.
 
     Attributes that only training changes, to be set before a `reset`: `mass_weight`, `trajectory_weight`,
-    `guidance_weight`, `guidance` (a key of `REFERENCE_PITCH`), `end_time` (s, at most the last phase's end) and two of
-    curricula: the *reward* pays R_terminal with `terminal_scale`, `final_info` reports it with `TERMINAL_SCALE`; draws
-    are `draw_scale` times as large, and may then leave the observation space.
+    `guidance_weight`, `guidance` (a key of `REFERENCE_PITCH`), `end_time` (s, at most the last phase's end) and
+    `terminal_scale`, a curriculum: the *reward* pays R_terminal with it, `final_info` reports it with `TERMINAL_SCALE`.
     """
 
     metadata = {**BatchedEnv.metadata, **DRAWN}
@@ -107,7 +106,7 @@ class RocketVectorEnv(BatchedEnv):
         self.action_frame, self.observe_phase = action_frame, observe_phase
         self.dispersion, self.observe_draw, self.observe_mass = dispersion, observe_draw, observe_mass
         self.mass_weight, self.trajectory_weight, self.guidance_weight, self.guidance = 0.0, 0.0, 0.1, "none"
-        self.terminal_scale, self._draw_scale = TERMINAL_SCALE, 1.0
+        self.terminal_scale = TERMINAL_SCALE
         super().__init__(num_envs, 1, *self._spaces(), render_mode)
         self._build()
         self.end_time = self.rocket.end_time  # sets episode_steps, too
@@ -162,22 +161,6 @@ class RocketVectorEnv(BatchedEnv):
         self._table = None if self.dispersion else self._work_out(np.arange(self.episode_steps + 1), self._largest)
         self._set_ends(self.vehicles)
 
-    @property
-    def draw_scale(self) -> float:
-        """Factor on the scores that an episode draws; 1 is the dispersion as it was given."""
-        return self._draw_scale
-
-    @draw_scale.setter
-    def draw_scale(self, value: float):
-        if not 0 < value < np.inf:
-            raise ValueError(f"draw_scale is {value}; it must be positive and finite")
-        self._draw_scale = float(value)
-        if self.dispersion:
-            self._draw_bounds = draw_bounds(self.rocket, self.dispersion, value)
-            largest = largest_draw(self.rocket, self.dispersion, value)
-            self._largest = draw_vehicles(self.rocket, self.dispersion, largest)
-            self.end_time = self.end_time  # sets episode_steps: the largest vehicle burns longest
-
     def _set_ends(self, vehicles):
         """When the episodes of these vehicles end at the latest: sets and returns the number of their steps."""
         own = self.dispersion and self.cutoff and self._end_time == self.rocket.end_time == self.rocket.burns[-1].end
@@ -205,7 +188,7 @@ class RocketVectorEnv(BatchedEnv):
     def _launch(self, mask, given):
         """Vehicles for the environments in `mask`: of the given draws (N, k), else of their own."""
         if given is None:
-            draw = self.draw_scale * self.np_random.standard_normal((int(mask.sum()), self.draw.shape[1]))
+            draw = self.np_random.standard_normal((int(mask.sum()), self.draw.shape[1]))
             draw = np.clip(draw, -self._draw_bounds, self._draw_bounds)
         else:
             draw = self._checked_draw(given)[mask]
@@ -443,7 +426,6 @@ class RocketEnv(SingleEnv):
     guidance = of_batch("guidance", "The reference pitch of R_guidance, a key of REFERENCE_PITCH.")
     end_time = of_batch("end_time", "Seconds after which an episode ends at the latest.")
     terminal_scale = of_batch("terminal_scale", "The scale of R_terminal in the reward; reports keep TERMINAL_SCALE.")
-    draw_scale = of_batch("draw_scale", "Factor on the scores that an episode draws.")
     draw = of_batch("draw", "The running episode's standard scores (1, k), zeros without dispersion.")
 
 

@@ -412,40 +412,6 @@ def test_seeds():
     assert (draws[0] != draws[2]).all() and len(np.unique(draws[0])) == draws[0].size
 
 
-@pytest.mark.parametrize("scale", [0.5, 1.0, 4.0])
-def test_draw_scale_draws_the_same_vehicles_further_from_the_nominal(scale):
-    """Training alone draws so: the same stream, times the scale; a drag is changed by 90 % at most, the rest by 3."""
-    once, scaled = make(CUTOFF, 500), make(CUTOFF, 500)
-    steps = scaled.episode_steps
-    once.reset(seed=4)
-    scaled.draw_scale = scale
-    scaled.reset(seed=4)
-    most = np.full(16, 3 * scale)
-    most[DRAW.index("drag")] = min(3 * scale, 0.9 / 0.14)
-    inside = np.abs(once.draw) < 3  # clipped before and after it is scaled is the same
-    further = (scale * once.draw).clip(-most, most)
-    np.testing.assert_allclose(scaled.draw[inside], further[inside])
-    assert (np.abs(scaled.draw) <= most + 1e-12).all()
-    for mine, given in zip(scaled.vehicles, envs.draw_vehicles(ROCKET, 1.0, scaled.draw)):
-        np.testing.assert_array_equal(mine, given)
-    # room for the slowest: nominally 700 s of stage 2 after 261 s, 0.5 % and 0.3 % a score
-    slowest = 261 / (1 - 0.005 * 3 * scale) + 700 * (1 + 0.003 * 3 * scale) / (1 - 0.005 * 3 * scale)
-    assert steps <= scaled.episode_steps or scale < 1
-    assert scaled.episode_steps == pytest.approx(slowest / 2, rel=0.02)
-    scaled.draw_scale = 1.0
-    assert scaled.episode_steps >= steps  # the flights that run now may still be long
-    scaled.reset(seed=4)
-    np.testing.assert_array_equal(scaled.draw, once.draw)
-
-
-@pytest.mark.parametrize("scale", [0.0, -1.0, math.inf, math.nan])
-def test_bad_draw_scales_are_refused(scale):
-    for env in (make(CUTOFF, 2), gym.make(CUTOFF, dispersion=1).unwrapped):
-        with pytest.raises(ValueError, match=f"draw_scale is {scale}; it must be positive and finite"):
-            env.draw_scale = scale
-        assert env.draw_scale == 1.0
-
-
 def test_autoreset_draws_anew_only_for_those_that_ended():
     batch = make(CUTOFF, 3)
     batch.reset(seed=1)
