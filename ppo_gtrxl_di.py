@@ -64,7 +64,7 @@ class Args:
     hidden_dim: int = 128  # width of the hidden layer of each head
     memory_noise: float = 0.1  # spread of the memory before an episode's start (Algorithm 1, line 5; the value is ours)
 
-    # PPO (Table 1 where it has a row; README has the rest)
+    # PPO (Table 1 where it has a row; docs/decisions.md has the rest)
     total_updates: int = 1000  # number of updates
     num_envs: int = 80  # parallel environments, one episode each per update (256 steps of 16 workers, a guess)
     learning_rate: float = 3e-4  # learning rate of the first update; with --lr-schedule std where the deviation is 1
@@ -385,7 +385,7 @@ def linear_fit(x, y, alive):
 
     Each episode is in its own fit. Its residual is 1 - l times that of a fit without it, with the leverage l a function
     of the states at this step alone, not of the action: a state's gradient keeps its direction, extreme states count
-    less. (A fit without it was worse: README.)
+    less. (A fit without it was worse: docs/training-notes.md.)
     """
     weight, count = alive.double()[..., None], alive.double().sum(-1)[..., None, None].clamp(min=1)
     x, y = x.double(), y.double()[..., None]

@@ -60,7 +60,7 @@ class Args:
     mass_weight: float = 1.0  # cut-off: reward lost for each 1.5 % of the dry mass (100 kg) burnt in the last phase
     reward_scale: float = 0.2  # factor on the rewards in training; everything logged is unscaled
 
-    # transformer (a laptop's; README has Table 1's beside ours)
+    # transformer (a laptop's; docs/decisions.md has Table 1's beside ours)
     num_blocks: int = 2  # number of GTrXL blocks (0: a plain MLP, without memory)
     embed_dim: int = 64  # embedding dimension d
     num_heads: int = 4  # number of attention heads
@@ -69,7 +69,7 @@ class Args:
     hidden_dim: int = 64  # width of the hidden layer of each head
     memory_noise: float = 0.1  # spread of the memory before an episode's start (Algorithm 1, line 5; the value is ours)
 
-    # PPO (README has Table 1's beside ours)
+    # PPO (docs/decisions.md has Table 1's beside ours)
     total_updates: int = 500  # number of updates
     num_envs: int = 32  # parallel environments, one episode each per update
     learning_rate: float = 3e-3  # learning rate of the first update; with --lr-schedule std where the deviation is 1
@@ -467,7 +467,7 @@ def linear_fit(x, y, alive):
 
     Each episode is in its own fit. Its residual is 1 - l times that of a fit without it, with the leverage l a function
     of the states at this step alone, not of the action: a state's gradient keeps its direction, extreme states count
-    less. (A fit without it was worse: README.)
+    less. (A fit without it was worse: docs/training-notes.md.)
     """
     weight, count = alive.double()[..., None], alive.double().sum(-1)[..., None, None].clamp(min=1)
     x, y = x.double(), y.double()[..., None]
