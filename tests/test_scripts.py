@@ -559,7 +559,7 @@ def test_phases_are_one_hot_whatever_their_number(number):
     assert len(phases) == number
     obs = torch.tensor([[6.4e6, 0.0, 0.0, 0.0, 7e3, 0.0, 1e4, 0.5, phase] for phase in phases], dtype=torch.float32)
     seen = ROCKET.features(agent, obs)
-    assert seen.shape[1] == 13 + 2 * 6 + number  # state, error and its tanh
+    assert seen.shape[1] == 13 + 2 * 6 + number + 7  # state, error, its tanh, and what differs from the mean flight
     if number > 1:
         (columns,) = np.nonzero((seen != seen[0]).any(0).numpy())
         assert len(columns) == number and torch.equal(seen[:, columns], torch.eye(number))
