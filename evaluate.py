@@ -549,7 +549,25 @@ def rocket_seed_lines(runs: list[dict]) -> list[str]:
     errors, masses = ([run[key] for run in runs] for key in ("error_norm", "final_mass_kg"))
     spread = f"median ||error|| {np.median(errors):.6f}, {min(errors):.6f} to {max(errors):.6f}"
     mass = f"median final mass {np.median(masses):.2f} kg, {min(masses):.2f} to {max(masses):.2f}"
-    return [*lines, f"  {len(runs)} seeds: {spread}; {mass}"]
+    return [*lines, f"  {len(runs)} seeds: {spread}; {mass}", *dispersed_seed_lines(runs)]
+
+
+def dispersed_seed_lines(runs: list[dict]) -> list[str]:
+    """Of the runs that were also flown dispersed: the spread of each, and of several medians and ranges."""
+    runs = [run for run in runs if "dispersed_perigee_error_std_km" in run]
+    lines = []
+    for run in runs:
+        flights = f"{run['dispersed_starts']} flights at dispersion {run['dispersion']:g}"
+        errors = f"||error|| median {run['dispersed_error_median']:.6f}, p95 {run['dispersed_error_p95']:.6f}"
+        perigee = " ± ".join(f"{run[f'dispersed_perigee_error_{part}_km']:.2f}" for part in ("mean", "std"))
+        ends = f"perigee {perigee} km off, {run['dispersed_box_rate']:.1%} in the box"
+        lines.append(f"  seed {run['seed']}, {flights}: {errors}; {ends}, {run['dispersed_mass_mean_kg']:.2f} kg")
+    if len(runs) > 1:
+        medians, rates = ([run[f"dispersed_{key}"] for run in runs] for key in ("error_median", "box_rate"))
+        spread = f"median of the medians {np.median(medians):.6f}, {min(medians):.6f} to {max(medians):.6f}"
+        box = f"in the box {np.median(rates):.1%}, {min(rates):.1%} to {max(rates):.1%}"
+        lines.append(f"  {len(runs)} seeds, dispersed: {spread}; {box}")
+    return lines
 
 
 # ---------------------------------------------------------------------------------------------------------------------
