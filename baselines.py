@@ -16,6 +16,10 @@ training needs neither before its first evaluation.
 
 from __future__ import annotations
 
+from rocket_baselines import *  # noqa: F403 - every name of it is also one of baselines.py
+
+# the star stands first: after the imports below, a type checker would lose sight of np
+# isort: split
 import argparse
 import json
 import os
@@ -31,7 +35,6 @@ from pathlib import Path
 import numpy as np
 
 from envs import DOUBLE_INTEGRATOR, PROBLEMS, ROCKETS, BadInput, Problem, fly, rk4
-from rocket_baselines import *  # noqa: F403 - every name of it is also one of baselines.py
 from rocket_baselines import (
     ASCENTS,
     CUTOFF,
@@ -567,7 +570,7 @@ def output(text: str) -> Path:
 
 def parse_args(argv=None):
     """One sub-command per problem; each sets `run`, the function that the main part calls with the arguments."""
-    parser = OneLineParser(description=__doc__.splitlines()[0])
+    parser = OneLineParser(description=str(__doc__).splitlines()[0])
     commands = parser.add_subparsers(dest="command", required=True)
     for env_id in PROBLEMS:
         names = [SHORT_NAMES[env_id]] if env_id in SHORT_NAMES else []

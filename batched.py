@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import gymnasium as gym
 import numpy as np
 from gymnasium.error import ResetNeeded
@@ -43,6 +45,13 @@ class BatchedEnv(VectorEnv):
     """
 
     metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
+    single_observation_space: Box
+    single_action_space: Box
+    _start: Callable  # the problem's
+    _observe: Callable
+    _advance: Callable
+    _snapshot: Callable
+    _make_sheet: Callable
 
     def __init__(
         self,
@@ -177,7 +186,8 @@ class SingleEnv(gym.Env):
         if self.render_mode is None:
             warn_of_no_mode(self)
             return None
-        return self.batch.render()[0]
+        frames = self.batch.render()
+        return frames[0] if frames else None
 
 
 def of_batch(name: str, doc: str) -> property:

@@ -17,22 +17,27 @@ To add a problem of this kind: write its dynamics, its table, and one line in `P
 
 from __future__ import annotations
 
+from batched import *  # noqa: F403 - every name of these three is also one of envs.py
+from rocket import *  # noqa: F403
+from rocket_env import *  # noqa: F403
+
+# the stars stand first: after the imports below, a type checker would lose sight of np and gym
+# isort: split
 import importlib
 import sys
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.envs.registration import ENV_ID_RE
 from gymnasium.spaces import Box
 
-from batched import *  # noqa: F403 - every name of these three is also one of envs.py
 from batched import DRAWN, BatchedEnv, SingleEnv, of_batch, rk4
-from rocket import *  # noqa: F403
 from rocket import PAPER_MISSION, ROCKETS, BadInput, Mission, Rocket
-from rocket_env import *  # noqa: F403
 from rocket_env import make_rocket
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -300,7 +305,7 @@ def fly(env_id: str, policy: Callable, x0, **options) -> dict:
 
     Returns x (n, T+1, 2), the applied (clipped) u (n, T), reward (n, T), and the arrays of `final_info`.
     """
-    envs = gym.make_vec(env_id, num_envs=len(x0), **options)
+    envs: Any = gym.make_vec(env_id, num_envs=len(x0), **options)  # a PhasedVectorEnv
     problem = PROBLEMS[env_id]
     x = np.empty((len(x0), problem.steps + 1, 2))
     u, reward = np.empty((2, len(x0), problem.steps))
@@ -335,7 +340,7 @@ def register_rocket(env_id: str, rocket: Rocket, cutoff: bool = False, ceiling_k
     warning if it was another rocket's. Raises BadInput where the id is another environment's or not one of Gymnasium's.
     """
     others = gym.registry.keys() - ROCKETS.keys()
-    if env_id in others or not gym.envs.registration.ENV_ID_RE.fullmatch(env_id) or "/" in env_id:
+    if env_id in others or not ENV_ID_RE.fullmatch(env_id) or "/" in env_id:
         raise BadInput(f"env_id is {env_id!r}; it must be a new id such as MyRocket-v0")
     mission = Mission(rocket, cutoff, ceiling_km, **rules)
     if ROCKETS.get(env_id, mission) != mission:

@@ -220,7 +220,7 @@ def ratio_lines(metrics: dict) -> list[str]:
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def write_bytes(path, data: bytes):
+def write_bytes(path, data: bytes | memoryview):
     """Write a whole file."""
     with replacing(path) as file:
         file.write(data)

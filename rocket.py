@@ -98,13 +98,13 @@ class Burn:
 
 
 class OrbitalElements(NamedTuple):
-    """Keplerian elements, each an array over the states."""
+    """Keplerian elements, each an array over the states, or one orbit's number."""
 
-    a: np.ndarray  # semi-major axis, m (negative on a hyperbola, infinite on a parabola)
-    e: np.ndarray  # eccentricity
-    i: np.ndarray  # inclination, rad, 0..pi
-    raan: np.ndarray  # right ascension of the ascending node, rad, 0..2 pi; 0 on an equatorial orbit
-    argp: np.ndarray  # argument of perigee, rad, 0..2 pi; 0 on a circular orbit
+    a: np.ndarray | float  # semi-major axis, m (negative on a hyperbola, infinite on a parabola)
+    e: np.ndarray | float  # eccentricity
+    i: np.ndarray | float  # inclination, rad, 0..pi
+    raan: np.ndarray | float  # right ascension of the ascending node, rad, 0..2 pi; 0 on an equatorial orbit
+    argp: np.ndarray | float  # argument of perigee, rad, 0..2 pi; 0 on a circular orbit
 
 
 G0 = 9.80665  # m/s^2
@@ -475,7 +475,8 @@ def draw_vehicles(rocket: Rocket, dispersion: float, draw: np.ndarray) -> Vehicl
         flow.append(sum(n * e.flow(rocket.table_isp) * rate[of(e)] for n, e in burn.engines))
     coast = (np.vstack([end, none + np.inf]), np.array([*thrust, none]), np.array([*flow, none]))
     mass = payload + empty(parts) + full(parts)
-    return Vehicles(mass, payload + empty(last), full(last), *coast, np.vstack([dropped, none]), burn_out, wind, drag)
+    dry_mass, propellant = payload + empty(last), none + full(last)
+    return Vehicles(mass, dry_mass, propellant, *coast, np.vstack([dropped, none]), burn_out, wind, drag)
 
 
 def burn_ends(rocket: Rocket, lasting: np.ndarray):

@@ -108,7 +108,8 @@ def collocation(rocket: Rocket, in_wind: bool = False):
     scale = ca.DM(state_scale(rocket))
     x, z, u = ca.SX.sym("x", 6), ca.SX.sym("z", 6, len(tau)), ca.SX.sym("u", 3, len(tau))
     mass, thrust, flow, dt = engine = ca.vertsplit(ca.SX.sym("engine", 4))
-    drag, *wind = air = ca.vertsplit(ca.SX.sym("air", 3)) if in_wind else [None]
+    air = ca.vertsplit(ca.SX.sym("air", 3)) if in_wind else []
+    drag, *wind = air or [None]
     rates = []
     for j in range(len(tau)):
         state, control = (
@@ -118,7 +119,7 @@ def collocation(rocket: Rocket, in_wind: bool = False):
         rates.append(ca.vertcat(*envs.ascent(state, control, rocket, wind or None, drag)[:6]) / scale)
     nodes = ca.horzcat(x, z)
     defects = nodes @ C - dt * ca.horzcat(*rates)
-    parameters = ca.vertcat(*engine, *(air if in_wind else []))
+    parameters = ca.vertcat(*engine, *air)
     return ca.Function("collocation", [x, z, u, parameters], [defects, nodes @ D])
 
 
@@ -362,8 +363,8 @@ def solve_ascent(case: Ascent):
     solution = optimise_ascent(case)
     optimum = solution if case.free else None
     if case.free:
-        t = np.append(rocket.dt * np.arange(np.ceil(optimum["final_time"] / rocket.dt)), optimum["final_time"])
-        directions = CubicSpline(optimum["t_u"], optimum["u"])((t[:-1] + t[1:]) / 2)
+        t = np.append(rocket.dt * np.arange(np.ceil(solution["final_time"] / rocket.dt)), solution["final_time"])
+        directions = CubicSpline(solution["t_u"], solution["u"])((t[:-1] + t[1:]) / 2)
     else:
         directions = solution["u"]
     seconds = time.perf_counter() - begin

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -217,7 +218,7 @@ class RocketVectorEnv(BatchedEnv):
         return np.abs(error).sum(axis=0), specific_energy(self.y, self.rocket.mu)
 
     def _observe(self):
-        obs = np.empty(self.observation_space.shape)
+        obs = np.empty((self.num_envs, *self.single_observation_space.shape))
         obs[:, :7] = self.y.T
         if self.observe_draw:
             obs[:, 9:] = self.draw
@@ -325,7 +326,7 @@ class RocketVectorEnv(BatchedEnv):
         if len(stiff):
             n = np.ceil((rate * dt)[stiff] / STIFF)  # for each its own: it must not depend on the rest of the batch
             y_sub, controls, dt = y[:, stiff], tuple(c[stiff] for c in controls), dt[stiff] / n
-            if self.dispersion:
+            if drag is not None and wind is not None:
                 drag, wind = drag[stiff], wind[:, stiff]
             for k in range(int(n.max())):
                 aloft = (y_sub[:3] ** 2).sum(axis=0) >= rocket.Re**2  # who is below the ground stays there
@@ -363,9 +364,10 @@ class RocketVectorEnv(BatchedEnv):
         parts = np.zeros_like(self._parts)
         parts[0] = orbital_reward(self._distance, distance)
         parts[1] = trajectory_reward(self._energy, energy, phase < self._last_phase, self.trajectory_weight)
-        if REFERENCE_PITCH[self.guidance] is not None:
+        reference_pitch = REFERENCE_PITCH[self.guidance]
+        if reference_pitch is not None:
             until = self.mission.guided_until or self.rocket.burns[0].end
-            times, angles = REFERENCE_PITCH[self.guidance]
+            times, angles = reference_pitch
             pitch = np.radians(np.interp(self.rocket.dt * t, until * np.array(times), angles, right=np.nan))
             parts[2] = guidance_reward(u, *local_frame(before, self._axes[2])[:2], pitch, self.guidance_weight)
         left = np.minimum(self.y[6] - self.vehicles.dry_mass, self.vehicles.propellant)
@@ -414,7 +416,7 @@ def reachable(rocket: Rocket, dispersion: float = 0.0) -> tuple[float, float]:
         gain *= np.log(heavy.mass[0] / light.dry_mass[0])
         end = max(end, heavy.burn_out[0])
     v_max = np.linalg.norm(rocket.x0[3:6]) + gain + rocket.mu / rocket.Re**2 * end
-    return rocket.Re + v_max * end, v_max
+    return float(rocket.Re + v_max * end), float(v_max)
 
 
 class RocketEnv(SingleEnv):
@@ -452,7 +454,7 @@ def fly_rocket(env_id: str, policy: Callable, end_time: float | None = None, dra
 
     Returns t (K+1,) s, u (K, 3) the unit directions in ECI, y (K+1, 7) r, v, m, reward (K,), and the last step's info.
     """
-    env = gym.make_vec(env_id, num_envs=1, **options)
+    env: Any = gym.make_vec(env_id, num_envs=1, **options)  # a RocketVectorEnv
     if end_time is not None:
         env.end_time = end_time
     obs, _ = env.reset(options=None if draw is None else {"draw": [draw]})

@@ -21,7 +21,7 @@ import zipfile
 from dataclasses import asdict
 from itertools import takewhile
 from pathlib import Path
-from typing import get_type_hints
+from typing import Any, NoReturn, get_type_hints
 
 import gymnasium as gym
 import safetensors.torch
@@ -57,12 +57,12 @@ NOT_OF_A_CHECKPOINT = {"dispersion"}  # options of the environment that are chos
 MAY_CHANGE_ON_RESUME = {"resume", "cuda", "num_threads"}
 
 
-def fail(message):
+def fail(message) -> NoReturn:
     """End with one line on stderr and exit status 1."""
     sys.exit(f"error: {' '.join(str(message).split())}")
 
 
-def refuse(name, value, allowed):
+def refuse(name, value, allowed) -> NoReturn:
     """End with one line that names a field of Args as its flag, its value and what is allowed."""
     fail(f"--{name.replace('_', '-')} {value}: {allowed}")
 
@@ -177,7 +177,7 @@ def check_buffers(args, buffers):
     scale = buffers.get("observation_scale")
     if scale is None:
         return
-    (inputs,) = gym.make_vec(spec, num_envs=1).single_observation_space.shape
+    inputs = gym.spaces.flatdim(gym.make_vec(spec, num_envs=1).single_observation_space)
     if len(scale) != inputs:
         allowed = f"must hold {inputs} numbers, one for each of its observations"
         fail(f"BUFFERS of {args.exp_name}.py: observation_scale of {args.env_id} holds {len(scale)}; {allowed}")
@@ -260,8 +260,8 @@ def load_checkpoint(agent, args, saved):
     shapes = {name: array.shape for name, array in saved["tensors"].items()}
     if differing := [name for name in {**expected, **shapes} if expected.get(name) != shapes.get(name)]:
         name = differing[0]
-        theirs, ours = (shape.get(name, "missing") for shape in (shapes, expected))
-        why = f"{name} is {theirs} in the file and {ours} in this script"
+        theirs, here = (shape.get(name, "missing") for shape in (shapes, expected))
+        why = f"{name} is {theirs} in the file and {here} in this script"
         fail(f"--checkpoint {args.checkpoint}: does not fit its own args, BUFFERS or features ({why})")
     for name, constant in ours.items():
         learnt = not constant.any()  # zeros in a new agent
@@ -304,7 +304,9 @@ class Run:
         self.args, self.envs, self.env_options, self.describe = args, envs, env_options, describe
         self.modules = {"agent": agent, "average": average, "optimizer": optimizer}
         self.rank, _ = process()
-        self.folder, self.writer, self.metrics = None, None, {}
+        self.folder: Any = None  # a Path; it and TensorBoard's writer are of the first process, from `with run:` on
+        self.writer: Any = None
+        self.metrics = {}
         if self.rank > 0:  # the same weights, other noise
             torch.manual_seed(args.seed + 2**31 * self.rank)
         self.progress = {"seed": args.seed, "total_updates": 0, "global_step": 0}
@@ -468,7 +470,7 @@ def new_writer(folder, first_step, arguments):
 
 def track(args, name):
     """Follow the run with Weights and Biases."""
-    import wandb
+    import wandb  # pyright: ignore[reportMissingImports] - optional, not among the requirements
 
     names = {"project": args.wandb_project_name, "entity": args.wandb_entity, "name": name}
     wandb.init(**names, sync_tensorboard=True, config=asdict(args), save_code=True)
