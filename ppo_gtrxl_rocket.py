@@ -22,7 +22,7 @@ from torch.distributions import Normal
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 import runs
-from envs import ROCKETS, TERMINAL_SCALE, target_axes, target_orbit
+from envs import ROCKETS, TERMINAL_SCALE, target_constants
 from runs import total
 
 
@@ -108,20 +108,9 @@ DIFFERENCES = [0.03, 0.015, 0.005, 0.0015, 0.004, 0.003, 0.001]
 
 def constants(rocket):
     """What `features` reads as agent.<name> for a rocket; saved with the weights. Only `mean_flight` is learnt."""
-    axes = target_axes(rocket)  # rows: directions of perigee and semi-latus rectum, plane normal
-    h_target, e_target = target_orbit(rocket.target, rocket.mu)  # angular momentum and eccentricity vector
-    length, speed = rocket.Re, (rocket.mu / rocket.Re) ** 0.5  # units in which mu = 1: 6378 km and 7.9 km/s
     steps = rocket.end_time / rocket.dt
-    return {
-        "axes": axes.tolist(),
-        "units": [length] * 3 + [speed] * 3 + [rocket.dry_mass],
-        "h_target": (axes @ h_target / (length * speed)).tolist(),
-        "e_target": (axes @ e_target).tolist(),
-        "phases": np.linspace(0.0, 1.0, len(rocket.burns)).tolist(),
-        "steps": steps,
-        "differences": DIFFERENCES,
-        "mean_flight": np.zeros((math.ceil(steps) + 1, len(DIFFERENCES))).tolist(),
-    }
+    mean_flight = np.zeros((math.ceil(steps) + 1, len(DIFFERENCES))).tolist()
+    return target_constants(rocket) | {"steps": steps, "differences": DIFFERENCES, "mean_flight": mean_flight}
 
 
 BUFFERS = {env_id: constants(mission.rocket) for env_id, mission in ROCKETS.items()}
@@ -131,14 +120,12 @@ INITIAL_ACTION = [1.0, 0.0, 0.0]  # straight up: a randomly steered rocket never
 def motion(agent, obs):
     """Position and velocity (..., 3) in the target's axes and units, and what flights are compared by (..., 7)."""
     r, v, mass = (obs[..., :7] / agent.units).split([3, 3, 1], dim=-1)
-    r = r @ agent.axes.T  # towards the perigee, along the semi-latus rectum, normal to the plane
-    v = v @ agent.axes.T
+    r, v = r @ agent.axes.T, v @ agent.axes.T  # towards the perigee, along the semi-latus rectum, normal to the plane
     radius = r.norm(dim=-1, keepdim=True)
     altitude = 64 * (radius - 1)  # 64: the unit of length in 100 km
     radial_velocity = 8 * ((r * v).sum(dim=-1, keepdim=True) / radius)  # 8: the unit of speed in km/s
     out_of_plane = [64 * r[..., 2:], 8 * v[..., 2:]]
-    speed = v.norm(dim=-1, keepdim=True)
-    angle = torch.atan2(r[..., 1:2], r[..., :1])
+    speed, angle = v.norm(dim=-1, keepdim=True), torch.atan2(r[..., 1:2], r[..., :1])
     return r, v, torch.cat([altitude, radial_velocity, *out_of_plane, speed, mass.log(), angle], dim=-1)
 
 
@@ -157,20 +144,19 @@ def features(agent, obs):
     error = torch.cat([(h - agent.h_target) / agent.h_target.norm(), e - agent.e_target], dim=-1)
     phases = ((phase - agent.phases).abs() < 1e-3).to(obs.dtype)  # one-hot
     state = [r, v, compared[..., :5], t_norm, compared[..., 5:6], phases]
-    draw = obs[..., 9:]  # with --observe-draw
     step = ((1 - t_norm[..., 0]) * agent.steps).round().long().clamp(max=len(agent.mean_flight) - 1)
     mean_flight = agent.mean_flight[step]
     known = mean_flight.any(dim=-1, keepdim=True)  # zeros until there has been a flight to compare with
     differs = known * ((compared - mean_flight) / agent.differences).tanh()
-    return torch.cat([*state, error, (10 * error).tanh(), draw, differs], dim=-1)
+    # behind the nine: the draw, with --observe-draw
+    return torch.cat([*state, error, (10 * error).tanh(), obs[..., 9:], differs], dim=-1)
 
 
 @torch.no_grad()
 def learn_buffers(agent, args, batch):
-    """Move `mean_flight` a tenth of the way to the mean of the flights of an update, if they are dispersed.
+    """Move `mean_flight` a tenth of the way to the mean of an update's dispersed flights, at first all the way.
 
-    At first all the way; what then comes into the encoder's sight has no weight yet, so that it changes nothing. Steps
-    to which less than a quarter of the flights live are left alone.
+    What then comes into the encoder's sight has no weight yet. Steps that less than a quarter live to are left alone.
     """
     if not args.dispersion:
         return
@@ -215,11 +201,7 @@ def describe(episodes, metrics):
     if not metrics:
         return line
     orbit = f"a {metrics['a_km']:.1f} km  e {metrics['e']:.4f}  i {metrics['i_deg']:.2f}"
-    line = f"{line}  mean action: error {metrics['error_norm']:.5f}  {orbit}  mass {metrics['final_mass_kg']:.1f} kg"
-    if "dispersion" not in metrics:
-        return line
-    errors = f"median {metrics['dispersed_error_median']:.5f}  p95 {metrics['dispersed_error_p95']:.5f}"
-    return f"{line}  dispersed: {errors}"
+    return f"{line}  mean action: error {metrics['error_norm']:.5f}  {orbit}  mass {metrics['final_mass_kg']:.1f} kg"
 
 
 # Shared: Gated Transformer-XL ("Gated Transformer-XL Implementation") -------------------------------------------------

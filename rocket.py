@@ -652,6 +652,25 @@ def local_frame(y, normal):
 # ---------------------------------------------------------------------------------------------------------------------
 
 
+def target_constants(rocket: Rocket) -> dict:
+    """What a policy has to know of its target, as lists: the orbit in its own axes, in units in which mu = 1.
+
+    `axes` (3, 3), rows towards the perigee, along the semi-latus rectum and normal to the plane; `units` (7,) of r, v
+    and m (the Earth's radius, circular speed there, the dry mass); angular momentum `h_target` and eccentricity vector
+    `e_target` (3,); `phases`, what is observed of each burn.
+    """
+    axes = target_axes(rocket)
+    h_target, e_target = target_orbit(rocket.target, rocket.mu)
+    length, speed = rocket.Re, (rocket.mu / rocket.Re) ** 0.5  # 6378 km and 7.9 km/s
+    return {
+        "axes": axes.tolist(),
+        "units": [length] * 3 + [speed] * 3 + [rocket.dry_mass],
+        "h_target": (axes @ h_target / (length * speed)).tolist(),
+        "e_target": (axes @ e_target).tolist(),
+        "phases": np.linspace(0.0, 1.0, len(rocket.burns)).tolist(),
+    }
+
+
 def orbital_reward(distance, next_distance):
     """R_orbital = 10 (L_t - L_{t+1}), L the sum of |component| of the terminal error in the target orbit's axes.
 
