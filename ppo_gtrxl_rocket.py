@@ -99,8 +99,6 @@ class Args:
 # Problem: what differs from the other scripts -------------------------------------------------------------------------
 ENV_IDS = tuple(ROCKETS)
 ENV_OPTIONS = ("observe_phase", "action_frame", "dispersion", "observe_draw", "observe_mass")  # of the environments
-
-
 # sizes by which flights at dispersion 1 differ at the same step: altitude 3 km, climb rate 15 m/s, position and speed
 # out of the plane 0.5 km and 1.5 m/s, speed 30 m/s, the logarithm of the observed mass, angle flown 6 km of arc
 DIFFERENCES = [0.03, 0.015, 0.005, 0.0015, 0.004, 0.003, 0.001]
@@ -121,53 +119,43 @@ def motion(agent, obs):
     """Position and velocity (..., 3) in the target's axes and units, and what flights are compared by (..., 7)."""
     r, v, mass = (obs[..., :7] / agent.units).split([3, 3, 1], dim=-1)
     r, v = r @ agent.axes.T, v @ agent.axes.T  # towards the perigee, along the semi-latus rectum, normal to the plane
-    radius = r.norm(dim=-1, keepdim=True)
-    altitude = 64 * (radius - 1)  # 64: the unit of length in 100 km
-    radial_velocity = 8 * ((r * v).sum(dim=-1, keepdim=True) / radius)  # 8: the unit of speed in km/s
-    out_of_plane = [64 * r[..., 2:], 8 * v[..., 2:]]
-    speed, angle = v.norm(dim=-1, keepdim=True), torch.atan2(r[..., 1:2], r[..., :1])
-    return r, v, torch.cat([altitude, radial_velocity, *out_of_plane, speed, mass.log(), angle], dim=-1)
+    radius, speed = r.norm(dim=-1, keepdim=True), v.norm(dim=-1, keepdim=True)
+    altitude, climb = 64 * (radius - 1), 8 * (r * v).sum(dim=-1, keepdim=True) / radius  # in 100 km and km/s
+    angle = torch.atan2(r[..., 1:2], r[..., :1])
+    return r, v, torch.cat([altitude, climb, 64 * r[..., 2:], 8 * v[..., 2:], speed, mass.log(), angle], dim=-1)
 
 
 def features(agent, obs):
     """What the encoder sees of observations (..., 9 or more): the state in the target orbit's axes, and its error.
 
-    h = r x v, e = v x h - r / |r| (mu = 1), error = [(h - h_T) / |h_T|, e - e_T], given raw and as tanh(10 error), so
-    that small ones are seen. Last, what this flight differs by from the mean of all at the same step: beside the 200 km
-    that each climbs, the few that tell one dispersed flight from another would not be seen. Frame, scales and tanh are
-    ours: the paper gives the state alone.
+    h = r x v, e = v x h - r / |r| (mu = 1), error = [(h - h_T) / |h_T|, e - e_T], also as tanh(10 error): small ones
+    are seen. So is the little that this flight differs by from the mean of all at this step. All but the state is ours.
     """
     r, v, compared = motion(agent, obs)
     t_norm, phase = obs[..., 7:8], obs[..., 8:9]  # phase: 0 to 1, one of agent.phases (the paper's 0 to 3)
     h = torch.linalg.cross(r, v)
     e = torch.linalg.cross(v, h) - r / r.norm(dim=-1, keepdim=True)
     error = torch.cat([(h - agent.h_target) / agent.h_target.norm(), e - agent.e_target], dim=-1)
-    phases = ((phase - agent.phases).abs() < 1e-3).to(obs.dtype)  # one-hot
-    state = [r, v, compared[..., :5], t_norm, compared[..., 5:6], phases]
+    one_hot = ((phase - agent.phases).abs() < 1e-3).to(obs.dtype)
     step = ((1 - t_norm[..., 0]) * agent.steps).round().long().clamp(max=len(agent.mean_flight) - 1)
-    mean_flight = agent.mean_flight[step]
-    known = mean_flight.any(dim=-1, keepdim=True)  # zeros until there has been a flight to compare with
-    differs = known * ((compared - mean_flight) / agent.differences).tanh()
-    # behind the nine: the draw, with --observe-draw
-    return torch.cat([*state, error, (10 * error).tanh(), obs[..., 9:], differs], dim=-1)
+    mean = agent.mean_flight[step]  # zeros until there has been a flight to compare with
+    differs = mean.any(dim=-1, keepdim=True) * ((compared - mean) / agent.differences).tanh()
+    state = [r, v, compared[..., :5], t_norm, compared[..., 5:6], one_hot, error, (10 * error).tanh()]
+    return torch.cat([*state, obs[..., 9:], differs], dim=-1)  # behind the nine: the draw, with --observe-draw
 
 
 @torch.no_grad()
 def learn_buffers(agent, args, batch):
-    """Move `mean_flight` a tenth of the way to the mean of an update's dispersed flights, at first all the way.
-
-    What then comes into the encoder's sight has no weight yet. Steps that less than a quarter live to are left alone.
-    """
+    """Move `mean_flight` to the mean of an update's dispersed flights: at first all the way, then by a tenth."""
     if not args.dispersion:
         return
     if not agent.mean_flight.any():
-        agent.encoder[0].weight[:, -len(DIFFERENCES) :] = 0.0
+        agent.encoder[0].weight[:, -len(DIFFERENCES) :] = 0.0  # what comes into sight changes nothing at first
     rows = agent.mean_flight[: len(batch.obs)]  # a view
     alive = batch.alive[: len(rows)]
-    _, _, compared = motion(agent, batch.obs[: len(rows)])
-    mean, _ = moments(compared, alive[..., None], 1)
+    mean, _ = moments(motion(agent, batch.obs[: len(rows)])[2], alive[..., None], 1)
     share = total(alive.sum(1)) / total(torch.ones_like(alive).sum(1))
-    rate = torch.where(rows.any(dim=1), 0.1, 1.0) * (share >= 0.25)
+    rate = torch.where(rows.any(dim=1), 0.1, 1.0) * (share >= 0.25)  # few flights say little
     rows += rate[:, None] * (mean[:, 0] - rows)
 
 
@@ -185,8 +173,7 @@ def set_curriculum(envs, args, progress, refines, std):
     """
     envs.guidance = args.guidance
     envs.terminal_scale = min(TERMINAL_SCALE, max(std / 8, 0.001 if args.dispersion else 0.0))
-    ramp = np.clip((progress - 0.25) / (0.60 - 0.25), 0.0, 1.0)
-    envs.mass_weight = float(envs.cutoff * args.mass_weight * ramp)
+    envs.mass_weight = float(envs.cutoff * args.mass_weight * np.clip((progress - 0.25) / (0.60 - 0.25), 0.0, 1.0))
     return args.flights_per_start
 
 
