@@ -42,6 +42,10 @@ class BatchedEnv(VectorEnv):
     `final_info` arrays of the finished episodes; it is only called when there is one. One that can be drawn has
     `DRAWN` in its `metadata` and two more: `_snapshot()` returns time (N,) s, the control of the step before (N, m) and
     state (N, n), arrays of their own, and `_make_sheet(animation)` the drawing.
+
+    With the attribute `flights_per_start` G, to be set before a `reset` and only in training, environment k flies start
+    k // G, so that flights differ by their actions alone (1: each flies its own start; the last group is smaller where
+    G does not divide N). A dispersed rocket's start is its vehicle and air.
     """
 
     metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
@@ -74,6 +78,7 @@ class BatchedEnv(VectorEnv):
         self.observation_space = batch_space(single_observation_space, num_envs)
         self.action_space = batch_space(single_action_space, num_envs)
         self.t = np.zeros(num_envs, dtype=np.int64)  # steps flown in the running episode
+        self.flights_per_start = 1
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
         """Start every environment anew; returns (N, obs) float64 and an empty info."""
@@ -124,6 +129,13 @@ class BatchedEnv(VectorEnv):
         self._sheet = self._sheet or self._make_sheet(animation)
         columns = [[np.array(column) for column in zip(*trail)] for trail in self._trails]
         return tuple(self._sheet.frame(animation.Flight(t, u[1:], y)) for t, u, y in columns)
+
+    def _draw_starts(self, draw, count):
+        """Starts (count, k) of which each is `flights_per_start` environments'; `draw(n)` draws n of them, (n, k)."""
+        group = self.flights_per_start
+        if not (isinstance(group, int | np.integer) and group >= 1):
+            raise ValueError(f"flights_per_start is {group!r}; it must be a whole number of at least 1")
+        return np.repeat(draw(-(-count // group)), group, axis=0)[:count]  # rounded up
 
     def _restart(self, mask, options):
         self.t[mask] = 0

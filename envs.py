@@ -170,9 +170,7 @@ class PhasedVectorEnv(BatchedEnv):
     starts.
 
     Attributes that only training changes, to be set before a `reset`: `radius_scale`, a scalar or one number a phase,
-    enlarges the radii in which the *reward* pays the bonus (1 is the paper); with `flights_per_start` G environment k
-    flies start k // G, so that flights differ by their actions alone (1: each flies its own start; the last group is
-    smaller where G does not divide N).
+    enlarges the radii in which the *reward* pays the bonus (1 is the paper); and `flights_per_start` (`BatchedEnv`).
     """
 
     metadata = {**BatchedEnv.metadata, **DRAWN}
@@ -186,7 +184,7 @@ class PhasedVectorEnv(BatchedEnv):
         render_mode: str | None = None,
     ):
         self.problem, self.observe_phase, self.observe_velocity = problem, observe_phase, observe_velocity
-        self.radius_scale, self.flights_per_start = 1.0, 1
+        self.radius_scale = 1.0
         multi_phase = len(problem.phases) > 1
         target_max = np.max([np.abs(phase.target) for phase in problem.phases], axis=0)
         target_max[target_max == 0] = 1.0  # of velocity, where all waypoints are at rest: a box must have a width
@@ -227,11 +225,7 @@ class PhasedVectorEnv(BatchedEnv):
             if x0.shape != (self.num_envs, 2) or not np.isfinite(x0).all():
                 raise ValueError(f"options['x0'] must be finite, of shape ({self.num_envs}, 2); got {options['x0']!r}")
         else:
-            group = self.flights_per_start
-            if not (isinstance(group, int | np.integer) and group >= 1):
-                raise ValueError(f"flights_per_start is {group!r}; it must be a whole number of at least 1")
-            x0 = self.np_random.uniform(-bound, bound, (-(-count // group), 2))  # rounded up
-            x0 = np.repeat(x0, group, axis=0)[:count]
+            x0 = self._draw_starts(lambda n: self.np_random.uniform(-bound, bound, (n, 2)), count)
         for component, start in zip(self.x, x0.T):
             component[mask] = start
         self._running_cost[:, mask] = 0.0

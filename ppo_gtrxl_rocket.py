@@ -90,7 +90,7 @@ class Args:
     noise: str = "schedule"  # who sets the log-std: learned, schedule (linear), gated (linear, waits for the episodes)
     log_std: float = -1.4  # initial log of the policy's standard deviation, in the action's unit, -8 to 0.5
     log_std_final: float = -6.2  # log-std of the last update, where it is not learned to the end
-    flights_per_start: int = 32  # flights of each start, compared with one another (1: the paper)
+    flights_per_start: int = 32  # flights of each start or draw, compared with one another (1: the paper)
     refine_from: float | None = None  # part of the updates after which the refinement begins (none: never)
     log_std_refine: float | None = None  # log-std at the refinement's beginning (none: as it is)
     weight_average: float = 0.99  # decay of the averaged weights used in evaluation (0: off)
@@ -165,16 +165,16 @@ def mean_action(output, action_scale):
 
 
 def set_curriculum(envs, args, progress, refines, std):
-    """What only training changes, all of it ours; returns how many flights in a row have the same start: any number.
+    """What only training changes, all of it ours; returns how many flights in a row have the same start, or draw.
 
     Noise std scatters the ends of the flights by about std / 10: R_terminal need not be steeper; dispersed ones end
-    some 0.001 apart whatever the noise. Precision comes first, so that burning costs nothing in the first quarter of
-    the updates, and --mass-weight from 60 % on.
+    some 0.001 apart whatever the noise. Burning costs nothing in the first quarter, --mass-weight from 60 % on.
     """
     envs.guidance = args.guidance
     envs.terminal_scale = min(TERMINAL_SCALE, max(std / 8, 0.001 if args.dispersion else 0.0))
     envs.mass_weight = float(envs.cutoff * args.mass_weight * np.clip((progress - 0.25) / (0.60 - 0.25), 0.0, 1.0))
-    return args.flights_per_start
+    envs.flights_per_start = args.flights_per_start
+    return envs.flights_per_start
 
 
 def precise_enough(episodes, std):

@@ -78,8 +78,9 @@ class RocketVectorEnv(BatchedEnv):
     `episodic_return`, `points` (`precision_points`), `crashed`; with dispersion `draw` (N, k) and `dry`, out of fuel.
 
     Attributes that only training changes, to be set before a `reset`: `mass_weight`, `trajectory_weight`,
-    `guidance_weight`, `guidance` (a key of `REFERENCE_PITCH`), `end_time` (s, at most the last phase's end) and
-    `terminal_scale`, a curriculum: the *reward* pays R_terminal with it, `final_info` reports it with `TERMINAL_SCALE`.
+    `guidance_weight`, `guidance` (a key of `REFERENCE_PITCH`), `end_time` (s, at most the last phase's end),
+    `flights_per_start` (`BatchedEnv`; of each draw) and `terminal_scale`, a curriculum: the *reward* pays R_terminal
+    with it, `final_info` reports it with `TERMINAL_SCALE`.
     """
 
     metadata = {**BatchedEnv.metadata, **DRAWN}
@@ -189,8 +190,8 @@ class RocketVectorEnv(BatchedEnv):
     def _launch(self, mask, given):
         """Vehicles for the environments in `mask`: of the given draws (N, k), else of their own."""
         if given is None:
-            draw = self.np_random.standard_normal((int(mask.sum()), self.draw.shape[1]))
-            draw = np.clip(draw, -self._draw_bounds, self._draw_bounds)
+            scores = lambda n: self.np_random.standard_normal((n, self.draw.shape[1]))  # noqa: E731
+            draw = np.clip(self._draw_starts(scores, int(mask.sum())), -self._draw_bounds, self._draw_bounds)
         else:
             draw = self._checked_draw(given)[mask]
         drawn = draw_vehicles(self.rocket, self.dispersion, draw)  # before anything is changed: it may be refused

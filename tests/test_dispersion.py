@@ -412,6 +412,23 @@ def test_seeds():
     assert (draws[0] != draws[2]).all() and len(np.unique(draws[0])) == draws[0].size
 
 
+@pytest.mark.parametrize("num_envs, group, groups", [(6, 2, 3), (7, 3, 3)])
+def test_flights_of_a_group_share_their_draw(num_envs, group, groups):
+    """Flight k has draw k // G: the draws of a smaller batch, each G times; given draws stay each flight's own."""
+    batch, few = make(CUTOFF, num_envs), make(CUTOFF, groups)
+    batch.flights_per_start = group
+    rows = np.arange(num_envs) // group
+    for seed in (1, None):  # the second draws anew
+        batch.reset(seed=seed)
+        few.reset(seed=seed)
+        np.testing.assert_array_equal(batch.draw, few.draw[rows])
+        np.testing.assert_array_equal(batch.vehicles.mass, few.vehicles.mass[rows])
+        assert len(np.unique(batch.draw[:, 0])) == groups
+    given = np.linspace(-1, 1, batch.draw.size).reshape(batch.draw.shape)
+    batch.reset(options={"draw": given})
+    np.testing.assert_array_equal(batch.draw, given)
+
+
 def test_autoreset_draws_anew_only_for_those_that_ended():
     batch = make(CUTOFF, 3)
     batch.reset(seed=1)

@@ -450,8 +450,9 @@ def test_flights_per_start(env_id, num_envs, group, groups):
 
 
 @pytest.mark.parametrize("group", [0, -1, 1.5, math.nan, "2"])
-def test_bad_flights_per_start_are_refused(group):
-    envs = gym.make_vec("DoubleIntegrator-v0", num_envs=2)
+@pytest.mark.parametrize("env_id, options", [("DoubleIntegrator-v0", {}), ("RocketAscent-v0", {"dispersion": 1.0})])
+def test_bad_flights_per_start_are_refused(env_id, options, group):
+    envs = gym.make_vec(env_id, num_envs=2, **options)
     assert envs.unwrapped.flights_per_start == 1
     envs.unwrapped.flights_per_start = group
     with pytest.raises(ValueError, match="flights_per_start is .*; it must be a whole number of at least 1"):
