@@ -82,7 +82,7 @@ class Args:
     max_grad_norm: float = 0.5  # the maximum norm for the gradient clipping
     target_kl: float | None = None  # the KL divergence from which an update takes no further step (none: no limit)
     lr_schedule: str = "linear"  # linear, or std: --learning-rate times the policy's standard deviation
-    noise: str = "learned"  # who sets the log-std: learned, schedule (linear), gated (linear, waits for the episodes)
+    noise: str = "learned"  # who sets the log-std: learned (the optimiser) or schedule (linear)
     log_std: float = 0.0  # initial log of the policy's standard deviation, in the action's unit, -8 to 0.5
     log_std_final: float = -4.0  # log-std of the last update, where it is not learned to the end
     flights_per_start: int = 1  # flights of each start in the refinement, compared with one another (1: the paper)
@@ -126,11 +126,6 @@ def set_curriculum(envs, args, progress, refines, std):
     if len(envs.problem.phases) > 1:
         envs.radius_scale = 0.9 if refines else args.radius_curriculum**left
     return envs.flights_per_start
-
-
-def precise_enough(episodes, std):
-    """--noise gated: the noise falls once most of the sampled episodes hit every circle."""
-    return episodes["hit"].all(axis=1).mean() >= 0.85
 
 
 def describe(episodes, metrics):
@@ -520,8 +515,7 @@ def train(args, agent, average, optimizer, envs, run):
         learn_buffers(agent, args, batch)
 
         # the noise of the next update: linear to its last value, from wherever it is
-        falls = {"learned": refines, "schedule": True, "gated": precise_enough(episodes, std)}
-        if falls[args.noise]:
+        if args.noise == "schedule" or refines:
             updates_left = max(args.total_updates - iteration, 1)
             agent.actor_logstd.data += (args.log_std_final - agent.actor_logstd.data) / updates_left
         run.end_update(iteration, batch.alive, episodes, means, learning_rate)

@@ -87,7 +87,7 @@ class Args:
     max_grad_norm: float = 0.5  # the maximum norm for the gradient clipping
     target_kl: float | None = 0.02  # the KL divergence from which an update takes no further step (none: no limit)
     lr_schedule: str = "std"  # linear, or std: --learning-rate times the policy's standard deviation
-    noise: str = "schedule"  # who sets the log-std: learned, schedule (linear), gated (linear, waits for the episodes)
+    noise: str = "schedule"  # who sets the log-std: learned (the optimiser) or schedule (linear)
     log_std: float = -1.4  # initial log of the policy's standard deviation, in the action's unit, -8 to 0.5
     log_std_final: float = -6.2  # log-std of the last update, where it is not learned to the end
     flights_per_start: int = 32  # flights of each start or draw, compared with one another (1: the paper)
@@ -175,11 +175,6 @@ def set_curriculum(envs, args, progress, refines, std):
     envs.mass_weight = float(envs.cutoff * args.mass_weight * np.clip((progress - 0.25) / (0.60 - 0.25), 0.0, 1.0))
     envs.flights_per_start = args.flights_per_start
     return envs.flights_per_start
-
-
-def precise_enough(episodes, std):
-    """--noise gated: the noise falls once it is what makes the flights miss (0.2 std), or they hardly miss (0.02)."""
-    return np.median(episodes["error_norm"]) < max(0.2 * std, 0.02)
 
 
 def describe(episodes, metrics):
@@ -571,8 +566,7 @@ def train(args, agent, average, optimizer, envs, run):
         learn_buffers(agent, args, batch)
 
         # the noise of the next update: linear to its last value, from wherever it is
-        falls = {"learned": refines, "schedule": True, "gated": precise_enough(episodes, std)}
-        if falls[args.noise]:
+        if args.noise == "schedule" or refines:
             updates_left = max(args.total_updates - iteration, 1)
             agent.actor_logstd.data += (args.log_std_final - agent.actor_logstd.data) / updates_left
         run.end_update(iteration, batch.alive, episodes, means, learning_rate)

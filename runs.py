@@ -51,7 +51,7 @@ RANGES = {  # lowest and highest value of every numeric flag; NaN and infinity a
     **{"flights_per_start": (1, 10**6), "dispersion": (0.0, 10.0)},
 }
 CHOICES = {"action_frame": ("local", "eci"), "guidance": ("none", "linear", "knots")}
-CHOICES |= {"noise": ("learned", "schedule", "gated"), "lr_schedule": ("linear", "std")}
+CHOICES |= {"noise": ("learned", "schedule"), "lr_schedule": ("linear", "std")}
 NETWORK = ("num_blocks", "embed_dim", "num_heads", "memory_length", "mlp_dim", "hidden_dim")
 NOT_OF_A_CHECKPOINT = {"dispersion"}  # options of the environment that are chosen anew for every run and evaluation
 MAY_CHANGE_ON_RESUME = {"resume", "cuda", "num_threads"}

@@ -29,15 +29,13 @@ def script_args(script, **changes):
     return args
 
 
-def one_update(script, args, modules, envs, batch, episodes=None, iteration=1, group=None):
+def one_update(script, args, modules, envs, batch, iteration=1, group=None):
     """All that update `iteration` of `script.train` does but for its rollout; returns its losses.
 
-    modules: agent, average, optimiser. `batch` and `episodes` stand for what `rollout` returns; without episodes they
-    are not asked how precise they are. With a `group` the environments have no curriculum, and need only `num_envs`.
+    modules: agent, average, optimiser. `batch` stands for what `rollout` returns. With a `group` the environments have
+    no curriculum, and need only `num_envs`.
     """
-    given = {"rollout": lambda *inputs: (batch, episodes)}
-    if episodes is None:
-        given["precise_enough"] = lambda *inputs: False
+    given = {"rollout": lambda *inputs: (batch, None)}
     if group is not None:
         given["set_curriculum"] = lambda *inputs: group
     run = OneUpdate(iteration)

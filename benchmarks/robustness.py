@@ -139,7 +139,7 @@ def outcome(call, *inputs):
 
 
 WORDS = ["", "0", "1", "-1", "3", "4", "8", "1e-3", "0.5", "2.5", "nan", "inf", "-inf", "1e400", "10" * 20, "True"]
-WORDS += ["None", "none", "schedule", "std", "gated", "learned", "local", "RocketAscent-v0", "DoubleIntegrator-v0"]
+WORDS += ["None", "none", "schedule", "std", "learned", "local", "RocketAscent-v0", "DoubleIntegrator-v0"]
 WORDS += ["/", ".", "runs", "nowhere/file", "\0", "ü\n", "--", "-h", "'; rm -rf x", "[1]", "{}", "%s", "VanDerPol-v0"]
 
 

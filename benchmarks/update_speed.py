@@ -81,17 +81,16 @@ class Workbench:
         self.agent = self.script.Agent(args, self.envs)
         self.average = AveragedModel(self.agent, multi_avg_fn=get_ema_multi_avg_fn(args.weight_average))
         self.optimizer = torch.optim.Adam(self.agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
-        self.episodes = None  # the last rollout's
 
     def rollout(self):
         args = self.args
-        batch, self.episodes = self.script.rollout(self.agent, self.envs, args.reward_scale, args.memory_noise)
+        batch, _ = self.script.rollout(self.agent, self.envs, args.reward_scale, args.memory_noise)
         return batch
 
     def epoch(self, batch):
         """All that `train` does with the episodes: advantages, baseline, one epoch of minibatches, what is logged."""
         modules = self.agent, self.average, self.optimizer
-        return one_update(self.script, self.args, modules, self.envs, batch, self.episodes)
+        return one_update(self.script, self.args, modules, self.envs, batch)
 
 
 # --- FLOP -------------------------------------------------------------------------------------------------------------

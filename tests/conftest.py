@@ -76,10 +76,10 @@ def new_problem(monkeypatch):
     return register
 
 
-def update(script, args, modules, envs, batch, episodes=None, iteration=1):
+def update(script, args, modules, envs, batch, iteration=1):
     """One update of `script.train` on this batch, in groups of `envs.flights_per_start` and without a curriculum."""
     group = envs.flights_per_start
-    return one_update.one_update(script, args, modules, envs, batch, episodes, iteration, group)
+    return one_update.one_update(script, args, modules, envs, batch, iteration, group)
 
 
 @pytest.fixture(scope="module")

@@ -52,7 +52,7 @@ class Learner:
         envs.flights_per_start = self.args.flights_per_start
         self.agent = make_agent(self.args, envs)
         self.average = AveragedModel(self.agent, multi_avg_fn=get_ema_multi_avg_fn(0.9))
-        self.optimizer, self.episodes = RecordingAdam(self.agent), None  # what --noise gated looks at
+        self.optimizer = RecordingAdam(self.agent)
         self.collect()
 
     def collect(self):
@@ -60,7 +60,7 @@ class Learner:
 
     def update(self, iteration=1):
         modules = self.agent, self.average, self.optimizer
-        return update(script, self.args, modules, self.envs, self.batch, self.episodes, iteration)
+        return update(script, self.args, modules, self.envs, self.batch, iteration)
 
 
 @pytest.fixture
@@ -166,52 +166,37 @@ def test_learning_rate_follows_the_noise(schedules, log_std):
 # --- who sets the noise -----------------------------------------------------------------------------------------------
 
 
-def log_stds(run, hits):
-    """The log-std after each of the updates, of which these parts of the 20 sampled episodes hit their circles."""
+def log_stds(run, updates):
+    """The log-std after each of so many updates."""
     seen = []
-    for iteration, share in enumerate(hits, start=1):
-        run.episodes = {"hit": np.arange(20)[:, None] < share * 20}
+    for iteration in range(1, updates + 1):
         run.update(iteration)
         seen.append(run.agent.actor_logstd.item())
     return seen
 
 
 def test_scheduled_noise_is_linear(learner):
-    """From --log-std in update 1 to --log-std-final in the last one, whatever the episodes do."""
+    """From --log-std in update 1 to --log-std-final in the last one."""
     run = learner(noise="schedule", log_std=-0.5, log_std_final=-2.5, total_updates=11)
-    assert log_stds(run, [0.0] * 11) == pytest.approx([*np.linspace(-0.5, -2.5, 11)[1:], -2.5])
-
-
-def test_gated_noise_that_never_waits_is_the_scheduled_one(learner):
-    run = learner(noise="gated", log_std=-0.5, log_std_final=-2.5, total_updates=11)
-    assert log_stds(run, [1.0] * 11) == pytest.approx([*np.linspace(-0.5, -2.5, 11)[1:], -2.5])
-
-
-def test_gated_noise_waits_for_the_episodes(learner):
-    """17 of 20 are 85 %. Held it stays and never rises; then it falls to its end by equal steps over what is left."""
-    run = learner(noise="gated", log_std=-0.5, log_std_final=-2.5, total_updates=11)
-    hits = [0.8, 0.0, 0.85, 0.8, 0.8, 0.8, 0.85, 0.9, 1.0, 1.0, 1.0]
-    third = -0.5 - 2.0 / 8  # of eight updates left after the third
-    falling = [third + (-2.5 - third) * k / 4 for k in (1, 2, 3, 4)]  # four left after the seventh
-    assert log_stds(run, hits) == pytest.approx([-0.5, -0.5, *[third] * 4, *falling, -2.5])
+    assert log_stds(run, 11) == pytest.approx([*np.linspace(-0.5, -2.5, 11)[1:], -2.5])
 
 
 def test_noise_falls_from_wherever_it_is(learner):
     """A checkpoint's log-std may lie on either side of the last one."""
     for first in (-1.0, -4.0):
         run = learner(noise="schedule", log_std=first, log_std_final=-2.0, total_updates=3)
-        assert log_stds(run, [0.0] * 3) == pytest.approx([(first - 2.0) / 2, -2.0, -2.0])
+        assert log_stds(run, 3) == pytest.approx([(first - 2.0) / 2, -2.0, -2.0])
 
 
 def test_noise_reaches_minus_eight(learner):
     """The policy samples with what the schedule ends at: a standard deviation of 3e-4."""
     run = learner(noise="schedule", log_std_final=-8.0, total_updates=2)
-    assert log_stds(run, [0.0] * 2) == pytest.approx([-8.0, -8.0])
+    assert log_stds(run, 2) == pytest.approx([-8.0, -8.0])
     std = run.agent.get_policy(torch.zeros(1, 8, dtype=torch.float64)).stddev
     assert std.item() == pytest.approx(math.exp(-8.0))
 
 
-@pytest.mark.parametrize("noise", ["learned", "schedule", "gated"])
+@pytest.mark.parametrize("noise", ["learned", "schedule"])
 def test_only_learned_noise_is_learned(learner, noise):
     run = learner(noise=noise, log_std_final=TINY["log_std"])
     before = run.agent.actor_logstd.clone()
@@ -268,15 +253,10 @@ def test_noise_of_the_refinement(learner, log_std_refine):
     """Learned until update 5 of 11, then set, or left where it is, from where it falls by equal steps to its end."""
     settings = {"refine_from": 0.5, "log_std_refine": log_std_refine, "log_std_final": -5.0}
     run = learner(noise="learned", total_updates=11, **settings)
-    seen = log_stds(run, [0.0] * 11)
+    seen = log_stds(run, 11)
     assert len(set(seen[:5])) == 5 and np.abs(np.array(seen[:5]) - TINY["log_std"]).max() < 0.1
     first = seen[4] if log_std_refine is None else log_std_refine
     assert seen[5:] == pytest.approx([*np.linspace(first, -5.0, 6)[1:], -5.0])
-
-
-def test_gated_noise_waits_in_the_refinement_too(learner):
-    run = learner(noise="gated", total_updates=11, refine_from=0.0, log_std_refine=-2.0, log_std_final=-5.0)
-    assert log_stds(run, [0.0] * 11) == [-2.0] * 11
 
 
 @pytest.mark.parametrize("env_id", script.ENV_IDS)
