@@ -5,7 +5,8 @@
 
 Flies the mean action once (a rocket trained on dispersions: the first draw of `--eval-seed`, else the first start),
 draws a panel for each head, and prints how far back each looks: the mean distance under its weights, over the whole
-flight, in the 20 s after each staging (or the 1 s after each waypoint), and what uniform weights would give.
+flight, in the 20 s after each staging (or the 1 s after each waypoint), and what uniform weights would give. Then the
+gates: lambda's mean, the share of a block's input that passes each by, and what it was before training.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ import envs  # noqa: E402
 import evaluate  # noqa: E402
 import runs  # noqa: E402
 
+UNTRAINED = 1 / (1 + np.exp(-2.0))  # lambda under b_g alone
 SCRIPTS = [importlib.import_module(path.stem) for path in sorted(ROOT.glob("ppo_gtrxl_*.py"))]
 
 
@@ -81,6 +83,17 @@ def weights(agent, obs):
     return torch.stack(found).numpy()
 
 
+@torch.no_grad()
+def gates(agent, obs):
+    """Mean and standard deviation of lambda (blocks, 2 gates, 2) over a flight's steps and the d components."""
+    seen, opened = [], [gate for block in agent.blocks for gate in (block.gate1, block.gate2)]
+    hooks = [gate.linear.register_forward_hook(lambda *passed: seen.append(passed[-1].sigmoid())) for gate in opened]
+    agent.encode(torch.as_tensor(obs, dtype=agent.actor_logstd.dtype)[None], agent.new_memory(1, noise=0.0))
+    for hook in hooks:
+        hook.remove()
+    return np.array([[lam.mean(), lam.std(correction=0)] for lam in seen]).reshape(len(agent.blocks), 2, 2)
+
+
 def changes(env_id, obs, t):
     """When a new phase begins on a flight, s."""
     if env_id in envs.ROCKETS:
@@ -128,6 +141,15 @@ def lines(found, t, events):
     return rows
 
 
+def gate_lines(found):
+    """The printed table of `gates`."""
+    rows = [f"the gates' lambda, mean and standard deviation (before training about sigmoid(2) = {UNTRAINED:.2f})"]
+    for b, gate in enumerate(found, start=1):
+        first, second = (f"{mean:.2f} +- {spread:.2f}" for mean, spread in gate)
+        rows.append(f"  block {b}: past the attention {first}, past the MLP {second}")
+    return rows
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path, help="results/<name> or runs/...")
@@ -142,6 +164,7 @@ def main():
         found = weights(agent, obs)
         events = changes(args.env_id, obs, t)
         print("\n".join(lines(found, t, events)))
+        print("\n".join(gate_lines(gates(agent, obs))))
         draw(found, t, events, f"{args.env_id}: attention along one flight (lines: a new phase)").savefig(
             options.figure
         )

@@ -48,13 +48,35 @@ def test_weights_are_the_networks(L):
         np.testing.assert_allclose(out[0].numpy(), expected, atol=1e-12)
 
 
+@torch.no_grad()
+def test_gates_are_the_networks():
+    """A gate that is forced open or shut is found as such; an untrained one is near sigmoid(2)."""
+    args = script.Args(embed_dim=8, num_heads=2, mlp_dim=8, hidden_dim=8, num_blocks=2, memory_length=5)
+    torch.manual_seed(1)
+    agent = script.Agent(args, evaluate.envs.gym.make_vec(args.env_id, num_envs=1)).double()
+    obs = np.random.default_rng(0).uniform(-3, 3, (23, 3))
+    start = attention.gates(agent, obs)[..., 0]
+    assert start.shape == (2, 2) and np.abs(start - attention.UNTRAINED).max() < 0.1
+    for gate, bias in ((agent.blocks[0].gate2, 2.0), (agent.blocks[1].gate1, -1.0)):
+        gate.linear.weight.zero_()
+        gate.linear.bias.fill_(bias)
+    found = attention.gates(agent, obs)
+    np.testing.assert_allclose(found[0, 1], [1 / (1 + np.exp(-2.0)), 0.0], atol=1e-12)
+    np.testing.assert_allclose(found[1, 0], [1 / (1 + np.exp(1.0)), 0.0], atol=1e-12)
+
+
 @pytest.mark.parametrize("name, heads", [("vdp_waypoints", 6), ("rocket_cutoff", 8)])
 def test_attention_of_a_shipped_policy(name, heads, tmp_path, monkeypatch, capsys):
     path = tmp_path / "attention.png"
     monkeypatch.setattr(sys, "argv", ["attention.py", str(ROOT / "results" / name), str(path)])
     attention.main()
     printed = capsys.readouterr().out
-    assert printed.count("head") == heads and "after an event" in printed and imread(path).std() > 0.05
+    assert (
+        printed.count("head") == heads
+        and "after an event" in printed
+        and "past the MLP" in printed
+        and imread(path).std() > 0.05
+    )
 
 
 def evaluations(folder, values):
