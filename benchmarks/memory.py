@@ -1,7 +1,8 @@
 """What the memory is for: the table and the figure of results/memory, from the evaluations that its runs left there.
 
-    python benchmarks/run_seeds.py benchmarks/memory_jobs.txt --at-once 2 --numbers     # trains what is missing: hours
-    python benchmarks/memory.py                                                         # prints, draws: seconds
+    python benchmarks/run_seeds.py benchmarks/memory_nominal_jobs.txt --at-once 2    # trains what is missing: an hour
+    python benchmarks/run_seeds.py benchmarks/memory_jobs.txt --at-once 2 --numbers  # the same: hours
+    python benchmarks/memory.py                                                      # prints, draws: seconds
 
 Each row is one way of learning, each figure the median over its seeds with the range of all. Rows without a finished
 run are left out.

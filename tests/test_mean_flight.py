@@ -127,3 +127,17 @@ def test_what_comes_into_sight_changes_nothing_at_first(flights):
     assert (agent.encode(obs, memory) != before).any()
     script.learn_buffers(agent, args, flights)
     assert (agent.encoder[0].weight[:, -7:] == 0.5).all()
+
+
+def test_the_oracles_draw_changes_nothing_at_first(flights):
+    """Nominal flights have shown it zeros: the weights on it are still random when the dispersed training begins."""
+    args = script.Args(**SMALL, env_id=CUTOFF, dispersion=1.0, observe_draw=True)
+    agent = script.Agent(args, gym.make_vec(CUTOFF, num_envs=1, dispersion=1.0, observe_draw=True)).double()
+    draw = torch.randn(1, 8, 16, dtype=torch.float64).expand(60, 8, 16)
+    seen = script.Batch(**{**vars(flights), "obs": torch.cat([flights.obs, draw], dim=-1)})
+    zero = script.Batch(**{**vars(flights), "obs": torch.cat([flights.obs, 0 * draw], dim=-1)})
+    encode = lambda batch: agent.encode(batch.obs.transpose(0, 1), agent.new_memory(8, 0.0))  # noqa: E731
+    before = encode(zero)
+    assert (encode(seen) != before).any()
+    script.learn_buffers(agent, args, seen)
+    torch.testing.assert_close(encode(seen), before, rtol=0, atol=0)

@@ -104,9 +104,26 @@ def test_an_empty_folder_is_one_line(tmp_path, monkeypatch):
         memory.main()
 
 
-def test_every_row_of_the_tables_has_its_three_jobs():
+def nominal_flags():
+    """By the checkpoint that a line of memory_nominal_jobs.txt makes: what it decides in a run that begins with it."""
+    found = {}
+    for line in (ROOT / "benchmarks" / "memory_nominal_jobs.txt").read_text().splitlines():
+        if not line.startswith("#"):
+            folder, flags = line.split("  ppo_gtrxl_rocket.py --seed 1 ")
+            flags = flags.replace("--total-updates 300 ", "").replace(" --num-threads 1", "")
+            found[f"{folder}/agent.safetensors"] = flags
+    return found
+
+
+def test_every_row_of_the_tables_has_its_three_jobs(tmp_path):
     """Seeds 1 to 3 of each, by one command that differs from its neighbours by what the row says alone."""
-    jobs = run_seeds.read_jobs(ROOT / "benchmarks" / "memory_jobs.txt")
+    text, nominal = (ROOT / "benchmarks" / "memory_jobs.txt").read_text(), nominal_flags()
+    assert len(nominal) == len(memory.EXPERIMENTS["rocket"].rows)
+    for checkpoint, flags in nominal.items():
+        assert text.count(checkpoint) == 3
+        text = text.replace(f"--checkpoint {checkpoint}", flags)
+    (tmp_path / "jobs.txt").write_text(text)
+    jobs = run_seeds.read_jobs(tmp_path / "jobs.txt")
     for name, experiment in memory.EXPERIMENTS.items():
         for row in experiment.rows:
             seeds = [job.args["seed"] for job in jobs if job.results == Path("results/memory", name, row)]
