@@ -14,7 +14,7 @@ import runs
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
-ROCKETS = ("rocket_fixed", "rocket_cutoff", "two_stage_leo")
+ROCKETS = ("rocket_fixed", "rocket_cutoff", "rocket_dispersed", "two_stage_leo")
 OTHERS = ("di", "vdp", "di_waypoints", "vdp_waypoints")
 
 
@@ -101,6 +101,10 @@ def test_the_front_page_says_what_the_results_hold(result):
     if result in OTHERS:
         expected += [f"**{medians['ratio_of_sums']:.4f}**", f"{medians['ratio_mean']:.4f}"]
         assert medians["hit_rate"] == 1  # as the first line below the table says
+    elif "dispersed_error_median" in medians:
+        error, rate = (found[f"dispersed_{key}"] for key in ("error_median", "box_rate"))
+        expected += [f"**{np.median(error):.5f}** ({min(error):.5f} to {max(error):.5f})"]
+        expected += ["{:.1f} % ({:.1f} to {:.1f})".format(*(100 * f(rate) for f in (np.median, min, max)))]
     else:
         rocket = envs.ROCKETS[found["env_id"][0]].rocket
         expected += [f"**{medians['error_norm']:.5f}**", f"{medians['reference_error_norm']:.5f}"]
