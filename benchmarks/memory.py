@@ -42,7 +42,7 @@ EXPERIMENTS = {
         "Dispersed rocket, cut-off: ||error|| over 1705 flights",
         {
             **lengths(0, 8, 32, 128),
-            "mlp": "MLP",
+            "mlp": "MLP of about the same size",
             "true_mass": "L_mem 32, true mass seen",
             "oracle": "L_mem 32, draw seen",
         },
