@@ -150,7 +150,7 @@ def learn_buffers(agent, args, batch):
     if not args.dispersion:
         return
     if not agent.mean_flight.any():
-        new_inputs = len(DIFFERENCES) + batch.obs.shape[-1] - 9  # with --observe-draw the draw
+        new_inputs = len(DIFFERENCES) + batch.obs.shape[-1] - 9  # and, with --observe-draw, the draw
         agent.encoder[0].weight[:, -new_inputs:] = 0.0  # what comes into sight changes nothing at first
     rows = agent.mean_flight[: len(batch.obs)]  # a view
     alive = batch.alive[: len(rows)]
