@@ -450,6 +450,7 @@ def draw_ground_track(ax, arrays: dict, rocket: envs.Rocket):
 
 # policies first; not green, which is the target's
 LAWS = ("tab:red", "tab:orange", "tab:purple", "tab:cyan", "tab:brown", "tab:blue", "tab:pink", "tab:olive", "tab:gray")
+LAWS += ("black", "gold", "navy")
 
 
 def draw_dispersed(laws: dict[str, dict], metrics: dict) -> Figure:
