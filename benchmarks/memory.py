@@ -1,8 +1,9 @@
 """What the memory is for: the table and the figure of results/memory, from the evaluations that its runs left there.
 
-    python benchmarks/run_seeds.py benchmarks/memory_nominal_jobs.txt --at-once 2    # trains what is missing: an hour
-    python benchmarks/run_seeds.py benchmarks/memory_jobs.txt --at-once 2 --numbers  # the same: hours
-    python benchmarks/memory.py                                                      # prints, draws: seconds
+    python benchmarks/run_seeds.py benchmarks/memory_di_jobs.txt --at-once 2 --numbers      # trains what is missing
+    python benchmarks/run_seeds.py benchmarks/memory_nominal_jobs.txt --at-once 2           # the same: an hour
+    python benchmarks/run_seeds.py benchmarks/memory_rocket_jobs.txt --at-once 2 --numbers  # the same: hours
+    python benchmarks/memory.py                                                             # prints, draws: seconds
 
 Each row is one way of learning, each figure the median over its seeds with the range of all. Rows without a finished
 run are left out.
@@ -120,7 +121,7 @@ def main():
         results = {name: read(folder / name, experiment.rows) for name, experiment in EXPERIMENTS.items()}
         results = {name: found for name, found in results.items() if found}
         if not results:
-            raise ValueError(f"{folder} has no finished run; benchmarks/memory_jobs.txt lists them")
+            raise ValueError(f"{folder} has no finished run; benchmarks/memory_*_jobs.txt list them")
         for name, found in results.items():
             print("\n".join(table(EXPERIMENTS[name], found)))
         draw(results).savefig(folder / "memory.png", dpi=100)

@@ -61,10 +61,15 @@ class Job:
             return subprocess.Popen([sys.executable, ROOT / script, *flags], stdout=log, stderr=subprocess.STDOUT)
 
     def publish(self, numbers):
-        """Add the run, or its numbers alone, to its results folder, unless it is there already."""
-        run, published = self.run_dir(), self.results / "seeds" / f"{self.args['seed']}.json"
+        """Add the run, or its numbers alone, to its results folder, unless it is there already.
+
+        What the folder ships is replaced if it is another run of this seed.
+        """
+        run, seed, shipped = self.run_dir(), self.args["seed"], self.results / "eval.json"
+        published = self.results / "seeds" / f"{seed}.json"
         if not published.exists() or published.read_bytes() != (run / "eval.json").read_bytes():
-            evaluate.publish(run, self.results, numbers=numbers)
+            ship = shipped.exists() and evaluate.read_json(shipped)["seed"] == seed
+            evaluate.publish(run, self.results, ship=ship, numbers=numbers)
 
 
 def read_jobs(path):

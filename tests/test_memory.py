@@ -117,7 +117,8 @@ def nominal_flags():
 
 def test_every_row_of_the_tables_has_its_three_jobs(tmp_path):
     """Seeds 1 to 3 of each, by one command that differs from its neighbours by what the row says alone."""
-    text, nominal = (ROOT / "benchmarks" / "memory_jobs.txt").read_text(), nominal_flags()
+    lists = ("memory_di_jobs.txt", "memory_rocket_jobs.txt")
+    text, nominal = "\n".join((ROOT / "benchmarks" / name).read_text() for name in lists), nominal_flags()
     assert len(nominal) == len(memory.EXPERIMENTS["rocket"].rows)
     for checkpoint, flags in nominal.items():
         assert text.count(checkpoint) == 3

@@ -8,6 +8,9 @@ import time
 from pathlib import Path
 
 import pytest
+import run_seeds
+
+import evaluate
 
 ROOT = Path(__file__).parent.parent
 TINY = "--embed-dim 8 --num-heads 2 --num-blocks 1 --memory-length 4 --mlp-dim 8 --hidden-dim 8 --num-envs 2"
@@ -58,3 +61,15 @@ def test_a_job_with_a_bad_flag_stops_before_any_training(tmp_path):
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 1 and "--gamma 7.0: must be between 0.0 and 1.0" in errors
     assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize("seed, replaces", [(1, True), (2, False)])
+def test_a_new_run_of_the_shipped_seed_replaces_what_is_shipped(tmp_path, monkeypatch, seed, replaces):
+    run, results, published = tmp_path / "run", tmp_path / "results", []
+    for folder, shipped in ((run, seed), (results, 1)):
+        folder.mkdir()
+        (folder / "eval.json").write_text(json.dumps({"env_id": "VanDerPol-v0", "seed": shipped}))
+    monkeypatch.setattr(run_seeds.Job, "run_dir", lambda job: run)
+    monkeypatch.setattr(evaluate, "publish", lambda *args, **options: published.append((args, options)))
+    run_seeds.Job(results, [], {"seed": seed}).publish(numbers=False)
+    assert published == [((run, results), {"ship": replaces, "numbers": False})]
