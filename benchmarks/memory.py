@@ -6,13 +6,15 @@
     python benchmarks/memory.py                                                             # prints, draws: seconds
 
 Each row is one way of learning, each figure the median over its seeds with the range of all. Rows without a finished
-run are left out.
+run are left out. Beside the hidden velocity stands what no memory can beat.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,7 +23,9 @@ from matplotlib.figure import Figure
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
-from evaluate import read_json  # noqa: E402
+import baselines  # noqa: E402
+import envs  # noqa: E402
+import evaluate  # noqa: E402
 
 
 @dataclass
@@ -32,10 +36,29 @@ class Experiment:
     rows: dict[str, str]  # folder below results/memory/<experiment> -> what is printed of it
     keys: dict[str, str]  # key of eval.json -> what is printed of it; the first is drawn
     log: bool = False  # the figure's axis
+    bound: Callable | None = None  # what no memory can beat: () -> {key: value}
 
 
 def lengths(*steps):
     return {f"memory_{L}": f"L_mem {L}" for L in steps}
+
+
+@functools.cache
+def velocity_from_the_second_step():
+    """The double integrator's optimum when its first action is made without the velocity, over the starts of eval.json.
+
+    Two positions and the action between them tell the velocity, so a memory can know it from the second step on. The
+    first action is that of velocity zero, the mean over the starts: for quadratic costs the best (certainty
+    equivalence, e.g. Bertsekas, Dynamic Programming and Optimal Control, vol. 1); the bound on u hardly matters.
+    """
+    problem = envs.DOUBLE_INTEGRATOR
+    law, x0 = baselines.lqr_policy(problem), baselines.starts(0, 1000)
+
+    def blind_at_first(obs, t):
+        return law(obs * [1.0, float(t > 0), 1.0], t)
+
+    flight, best = (envs.fly(problem.env_id, flown, x0) for flown in (blind_at_first, law))
+    return evaluate.ratio_metrics(flight["cost"], best["cost"], 0) | {"hit_rate": flight["hit"].mean()}
 
 
 EXPERIMENTS = {
@@ -65,14 +88,16 @@ EXPERIMENTS = {
         "Double integrator, velocity hidden: cost over the optimum's, which sees it (ratio of sums)",
         {**lengths(0, 1, 4, 32), "shown": "L_mem 32, velocity shown"},
         {"ratio_of_sums": "ratio of sums", "ratio_p95": "p95", "hit_rate": "hit the circle"},
+        log=True,
+        bound=velocity_from_the_second_step,
     ),
 }
 
 
 def read(folder, rows):
     """The evaluations of every seed: row -> list of eval.json."""
-    found = {row: [read_json(path) for path in sorted((folder / row / "seeds").glob("*.json"))] for row in rows}
-    return {row: seeds for row, seeds in found.items() if seeds}
+    paths = {row: sorted((folder / row / "seeds").glob("*.json")) for row in rows}
+    return {row: [evaluate.read_json(path) for path in seeds] for row, seeds in paths.items() if seeds}
 
 
 def cell(values):
@@ -89,6 +114,9 @@ def table(experiment, found):
     for row, seeds in found.items():
         cells = [cell([run[key] for run in seeds if key in run]) for key in experiment.keys]
         lines.append([experiment.rows[row], str(len(seeds)), *cells])
+    if experiment.bound:
+        bound = experiment.bound()
+        lines.append(["no memory can beat", "", *(f"{bound[key]:.4g}" for key in experiment.keys)])
     widths = [max(map(len, column)) for column in zip(*lines)]
     printed = ["  ".join(word.ljust(width) for word, width in zip(line, widths)).rstrip() for line in lines]
     return [experiment.title, *(f"  {line}" for line in printed)]
@@ -106,6 +134,9 @@ def draw(results):
             ax.plot([x] * len(values), values, "o", color="tab:red", alpha=0.6)
             if values:
                 ax.hlines(np.median(values), x - 0.3, x + 0.3, color="tab:red")
+        if experiment.bound:
+            ax.axhline(experiment.bound()[key], color="0.5", linestyle="--", label="no memory can beat")
+            ax.legend()
         ax.set_xticks(range(len(found)), [experiment.rows[row] for row in found], rotation=30, ha="right")
         ax.set(ylabel=label, yscale="log" if experiment.log else "linear")
         ax.set_title(experiment.title.replace(": ", ":\n"), fontsize=9)

@@ -34,7 +34,7 @@ import envs  # noqa: E402
 import evaluate  # noqa: E402
 from sb3_env import NativeVecEnv  # noqa: E402
 
-PARTS = 10  # evaluated after each tenth of the samples
+PARTS = 20  # evaluated after each tenth of the samples
 SCRIPTS = ("ppo_gtrxl_di", "ppo_gtrxl_vdp", "ppo_gtrxl_rocket")
 
 
@@ -107,6 +107,7 @@ def main():
     parser.add_argument("--batch-size", type=int, default=64)
     parser.add_argument("--epochs", type=int, default=10)
     parser.add_argument("--learning-rate", type=float, default=3e-4, help="falls linearly to zero")
+    parser.add_argument("--gamma", type=float, default=1.0)
     parser.add_argument("--gae-lambda", type=float, default=0.95)
     parser.add_argument("--width", type=int, default=64, help="of the two hidden layers, and of the LSTM")
     parser.add_argument("--seed", type=int, default=1)
@@ -127,7 +128,7 @@ def main():
     if options.start:
         normalised = VecNormalize.load(Path(options.start).with_suffix(".pkl"), ours or venv)
     else:
-        normalised = VecNormalize(ours or venv, gamma=1.0, clip_reward=np.inf)
+        normalised = VecNormalize(ours or venv, gamma=options.gamma, clip_reward=np.inf)
     kind, policy = (RecurrentPPO, "MlpLstmPolicy") if options.recurrent else (PPO, "MlpPolicy")
     network = {"net_arch": [options.width] * 2, "log_std_init": args.log_std}
     if options.recurrent:
@@ -139,7 +140,7 @@ def main():
         n_steps=batch.unwrapped.episode_steps,
         batch_size=options.batch_size,
         n_epochs=options.epochs,
-        gamma=1.0,
+        gamma=options.gamma,
         gae_lambda=options.gae_lambda,
         policy_kwargs=network,
         seed=options.seed,

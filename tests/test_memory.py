@@ -13,6 +13,8 @@ import run_seeds
 import torch
 from matplotlib.image import imread
 
+import baselines
+import envs
 import evaluate
 import ppo_gtrxl_di as script
 
@@ -94,8 +96,24 @@ def test_table_and_figure_of_what_is_there(tmp_path, monkeypatch, capsys):
     title, header, *rows = capsys.readouterr().out.splitlines()
     assert "velocity hidden" in title and header.split()[:2] == ["seeds", "ratio"]
     assert rows[0].split("  ")[1:] and "L_mem 4" in rows[0] and "1.5 (1.25 to 3)" in rows[0] and " 3 " in rows[0]
-    assert "velocity shown" in rows[1] and "1.005" in rows[1] and "-" in rows[1] and len(rows) == 2
+    assert "velocity shown" in rows[1] and "1.005" in rows[1] and "-" in rows[1]
+    assert "no memory can beat" in rows[2] and len(rows) == 3
     assert imread(tmp_path / "memory.png").std() > 0.05
+
+
+def test_what_no_memory_can_beat_is_the_best_of_first_actions_that_see_the_position_alone():
+    """Against the costs to go of the states that other first actions lead to, the bound on u left out."""
+    problem = envs.DOUBLE_INTEGRATOR
+    (_, P), x0 = baselines.lqr(problem), baselines.starts(0, 1000)
+    (A, B), (phase,) = baselines.linearise(problem), problem.phases
+    ratios = []
+    for gain in np.linspace(0.0, 6.0, 601):
+        u = -gain * x0[:, 0]
+        x1 = x0 @ A.T + u[:, None] @ B.T
+        total = (x0**2) @ phase.Q + phase.R * u**2 + np.einsum("ni,ij,nj->n", x1, P[1], x1)
+        ratios.append(total.sum() / np.einsum("ni,ij,nj->n", x0, P[0], x0).sum())
+    assert memory.velocity_from_the_second_step()["ratio_of_sums"] == pytest.approx(min(ratios), abs=2e-3)
+    assert min(ratios) < ratios[0] - 0.04  # the first action matters
 
 
 def test_an_empty_folder_is_one_line(tmp_path, monkeypatch):
