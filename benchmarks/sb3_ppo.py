@@ -2,13 +2,13 @@
 
     pip install -r benchmarks/requirements.txt
     python benchmarks/sb3_ppo.py --env-id DoubleIntegrator-v0 --samples 2560000
-    python benchmarks/sb3_ppo.py --env-id RocketAscentCutoff-v0 --samples 7450000 --batch-size 256
+    python benchmarks/sb3_ppo.py --env-id RocketAscentCutoff-v0 --batch-size 512 --learning-rate 1e-3
     python benchmarks/sb3_ppo.py --env-id RocketAscentCutoff-v0 --recurrent --dispersion 1 --start RUN.zip
 
-It is given what our script gives its own learner: gamma = 1, the curriculum (the price of the propellant, the scale of
-R_terminal), the first mean action and its noise, the local frame, and our features of the observation, or with
---features raw the observation itself. The rest is that library's: feed-forward networks for actor and critic (an LSTM
-with --recurrent, of sb3-contrib), VecNormalize of inputs and rewards, its clipping, its epochs.
+It is given what our script gives its own learner: the curriculum (the price of the propellant, the scale of R_terminal),
+the first mean action and its noise, the local frame, and our features of the observation, or with --features raw the
+observation itself. The rest is that library's: feed-forward networks for actor and critic (an LSTM with --recurrent, of
+sb3-contrib), VecNormalize of inputs and rewards, its discount, clipping and epochs. `peers.py` runs and lists all.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ import envs  # noqa: E402
 import evaluate  # noqa: E402
 from sb3_env import NativeVecEnv  # noqa: E402
 
-PARTS = 20  # evaluated after each tenth of the samples
+PARTS = 20  # evaluated after each such part of the samples
 SCRIPTS = ("ppo_gtrxl_di", "ppo_gtrxl_vdp", "ppo_gtrxl_rocket")
 
 
@@ -107,7 +107,7 @@ def main():
     parser.add_argument("--batch-size", type=int, default=64)
     parser.add_argument("--epochs", type=int, default=10)
     parser.add_argument("--learning-rate", type=float, default=3e-4, help="falls linearly to zero")
-    parser.add_argument("--gamma", type=float, default=1.0)
+    parser.add_argument("--gamma", type=float, default=0.99)
     parser.add_argument("--gae-lambda", type=float, default=0.95)
     parser.add_argument("--width", type=int, default=64, help="of the two hidden layers, and of the LSTM")
     parser.add_argument("--seed", type=int, default=1)
@@ -160,7 +160,7 @@ def main():
     curve = []
 
     class Evaluation(BaseCallback):
-        """Stops the clock, evaluates after each tenth."""
+        """Stops the clock, evaluates after each part."""
 
         seconds, began = 0.0, 0.0
 

@@ -3,6 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 
 import envs
 
@@ -87,3 +88,47 @@ def test_native_batch_keeps_the_interface():
     assert batch.has_attr("radius_scale") and not batch.has_attr("no_such")
     batch.set_attr("radius_scale", 2.0)
     assert batch.batch.radius_scale == 2.0 and batch.env_is_wrapped(gym.Wrapper, 1) == [False]
+
+
+def test_the_benchmark_shows_what_our_encoder_sees():
+    """Over a flight and a crash, features of the wrapper against those of a script's own agent."""
+    pytest.importorskip("sb3_contrib")
+    import sb3_ppo
+
+    import ppo_gtrxl_rocket as script
+
+    env_id = "RocketAscentCutoff-v0"
+    batch = gym.make_vec(env_id, num_envs=2, action_frame="local")
+    agent = script.Agent(script.Args(env_id=env_id), batch)
+    venv, twin = sb3_ppo.OurFeatures(native(env_id, 2), script, env_id), native(env_id, 2)
+    seen, raw, crashes = venv.reset(), twin.reset(), 0
+    for _ in range(30):
+        np.testing.assert_array_equal(seen, script.features(agent, torch.as_tensor(raw)).numpy())
+        action = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
+        seen, _, dones, infos = venv.step(action)
+        raw, _, _, twins = twin.step(action)
+        for k in np.flatnonzero(dones):
+            crashes += 1
+            last = torch.as_tensor(twins[k]["terminal_observation"])
+            np.testing.assert_array_equal(infos[k]["terminal_observation"], script.features(agent, last).numpy())
+    assert crashes
+
+
+def test_the_benchmark_follows_our_curriculum():
+    pytest.importorskip("sb3_contrib")
+    import sb3_ppo
+
+    import ppo_gtrxl_rocket as script
+
+    env_id, args = "RocketAscentCutoff-v0", script.Args(env_id="RocketAscentCutoff-v0")
+    batch = gym.make_vec(env_id, num_envs=2, action_frame="local").unwrapped
+    model = PPO("MlpPolicy", NativeVecEnv(batch), n_steps=8, batch_size=16, n_epochs=1, device="cpu", seed=0)
+    model.total_samples, prices = 64, []
+
+    class Watch(sb3_ppo.OurCurriculum):
+        def _on_rollout_start(self):
+            super()._on_rollout_start()
+            prices.append((batch.mass_weight, batch.flights_per_start))
+
+    model.learn(64, callback=Watch(script, args, batch, "learned"))
+    assert prices == [(pytest.approx(np.clip((part - 0.25) / 0.35, 0, 1)), 1) for part in (0, 0.25, 0.5, 0.75)]
