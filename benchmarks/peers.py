@@ -71,9 +71,8 @@ def table():
     """Rows with different figures have headers of their own."""
     lines, keys = [], None
     for name, peer in PEERS.items():
-        runs = [
-            json.loads(path.read_text()) for seed in peer.seeds if (path := FOLDER / f"{name}_{seed}.json").exists()
-        ]
+        paths = [FOLDER / f"{name}_{seed}.json" for seed in peer.seeds]
+        runs = [json.loads(path.read_text()) for path in paths if path.exists()]
         if runs and peer.keys != keys:
             keys = peer.keys
             lines.append(["", "seeds", "samples", "minutes", *keys.values()])

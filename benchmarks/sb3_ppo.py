@@ -5,8 +5,8 @@
     python benchmarks/sb3_ppo.py --env-id RocketAscentCutoff-v0 --batch-size 512 --learning-rate 1e-3
     python benchmarks/sb3_ppo.py --env-id RocketAscentCutoff-v0 --recurrent --dispersion 1 --start RUN.zip
 
-It is given what our script gives its own learner: the curriculum (the price of the propellant, the scale of R_terminal),
-the first mean action and its noise, the local frame, and our features of the observation, or with --features raw the
+It is given what our script gives its own learner: the curriculum (price of the propellant, scale of R_terminal), the
+first mean action and its noise, the local frame, and our features of the observation, or with --features raw the
 observation itself. The rest is that library's: feed-forward networks for actor and critic (an LSTM with --recurrent, of
 sb3-contrib), VecNormalize of inputs and rewards, its discount, clipping and epochs. `peers.py` runs and lists all.
 """
