@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
@@ -62,6 +63,18 @@ def velocity_from_the_second_step():
 
 
 EXPERIMENTS = {
+    "hidden_velocity": Experiment(
+        "Double integrator, velocity hidden: cost over the optimum's, which sees it (ratio of sums)",
+        {**lengths(0, 1, 4, 32), "shown": "L_mem 32, velocity shown"},
+        {"ratio_of_sums": "ratio of sums", "ratio_p95": "p95", "hit_rate": "hit the circle"},
+        log=True,
+        bound=velocity_from_the_second_step,
+    ),
+    "hidden_phase": Experiment(
+        "Double integrator, two waypoints, time and phase hidden: share of the starts that hit both circles",
+        {**lengths(0, 8, 32, 100), "shown": "L_mem 32, both shown"},
+        {"hit_rate": "hit both", "hit_rate_phase_1": "circle 1", "hit_rate_phase_2": "circle 2", "cost_mean": "cost J"},
+    ),
     "rocket": Experiment(
         "Dispersed rocket, cut-off: ||error|| over 1705 flights",
         {
@@ -78,18 +91,6 @@ EXPERIMENTS = {
             "dispersed_mass_mean_kg": "mass (kg)",
         },
         log=True,
-    ),
-    "hidden_phase": Experiment(
-        "Double integrator, two waypoints, time and phase hidden: share of the starts that hit both circles",
-        {**lengths(0, 8, 32, 100), "shown": "L_mem 32, both shown"},
-        {"hit_rate": "hit both", "hit_rate_phase_1": "circle 1", "hit_rate_phase_2": "circle 2", "cost_mean": "cost J"},
-    ),
-    "hidden_velocity": Experiment(
-        "Double integrator, velocity hidden: cost over the optimum's, which sees it (ratio of sums)",
-        {**lengths(0, 1, 4, 32), "shown": "L_mem 32, velocity shown"},
-        {"ratio_of_sums": "ratio of sums", "ratio_p95": "p95", "hit_rate": "hit the circle"},
-        log=True,
-        bound=velocity_from_the_second_step,
     ),
 }
 
@@ -135,10 +136,20 @@ def draw(results):
             if values:
                 ax.hlines(np.median(values), x - 0.3, x + 0.3, color="tab:red")
         if experiment.bound:
-            ax.axhline(experiment.bound()[key], color="0.5", linestyle="--", label="no memory can beat")
+            ax.axhline(
+                experiment.bound()[key],
+                color="0.5",
+                linestyle="--",
+                label=f"no memory can beat {experiment.bound()[key]:.3g}",
+            )
             ax.legend()
         ax.set_xticks(range(len(found)), [experiment.rows[row] for row in found], rotation=30, ha="right")
-        ax.set(ylabel=label, yscale="log" if experiment.log else "linear")
+        ax.set_ylabel(label)
+        if experiment.log:
+            ax.set_yscale("log")
+            ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            ax.yaxis.set_major_formatter("{x:g}")
+            ax.yaxis.set_minor_formatter(NullFormatter())
         ax.set_title(experiment.title.replace(": ", ":\n"), fontsize=9)
         ax.grid(alpha=0.3)
     return figure
