@@ -20,7 +20,7 @@ OTHERS = ("di", "vdp", "di_waypoints", "vdp_waypoints")
 
 def text_of(path):
     """A page without its code blocks."""
-    return re.sub(r"^ *```.*?^ *```", "", path.read_text(), flags=re.DOTALL | re.MULTILINE)
+    return re.sub(r"^ *(?:\d+\. )?```.*?^ *```", "", path.read_text(), flags=re.DOTALL | re.MULTILINE)
 
 
 def anchor(heading):
