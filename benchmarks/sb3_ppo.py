@@ -193,8 +193,7 @@ def main():
         model.save(options.save)
         normalised.save(Path(options.save).with_suffix(".pkl"))
     if options.json:
-        record = {"command": " ".join(sys.argv[1:]), "curve": curve, "final": evaluation.metrics}
-        Path(options.json).write_text(json.dumps(record, indent=1) + "\n")
+        Path(options.json).write_text(json.dumps({"curve": curve, "final": evaluation.metrics}, indent=1) + "\n")
 
 
 if __name__ == "__main__":
