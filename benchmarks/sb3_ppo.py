@@ -61,139 +61,149 @@ class OurFeatures(VecEnvWrapper):
 
 
 class OurCurriculum(BaseCallback):
-    """Before each rollout, what our script changes by the share of training done; and its noise, where that is set."""
+    """Before each rollout, what our script changes by the share of training done."""
 
-    def __init__(self, script, args, batch, noise):
+    def __init__(self, script, args, batch, samples):
         super().__init__()
-        self.script, self.args, self.batch, self.noise = script, args, batch, noise
+        self.script, self.args, self.batch, self.samples = script, args, batch, samples
 
     def _on_rollout_start(self):
-        progress = self.num_timesteps / self.model.total_samples
-        if self.noise == "schedule":
-            first, last = self.args.log_std, self.args.log_std_final
-            self.model.policy.log_std.data.fill_(first + (last - first) * min(progress, 1.0))
-            self.model.policy.log_std.requires_grad_(False)
         std = self.model.policy.log_std.exp().mean().item()
-        self.script.set_curriculum(self.batch, self.args, progress, False, std)
+        self.script.set_curriculum(self.batch, self.args, self.num_timesteps / self.samples, False, std)
         self.batch.flights_per_start = 1  # the library compares no flights of one start
 
     def _on_step(self):
         return True
 
 
-def make_policy(model, inputs):
+class Evaluation(BaseCallback):
+    """Evaluates after each part of the samples; `curve` has the processor's minutes of all but that."""
+
+    def __init__(self, env_id, env_options, samples):
+        super().__init__()
+        self.env_id, self.env_options, self.samples = env_id, env_options, samples
+        self.keys = ["error_norm", "mass_ratio"] if env_id in envs.ROCKETS else ["ratio_of_sums", "ratio_p95"]
+        if env_options.get("dispersion"):
+            self.keys += ["dispersed_error_median", "dispersed_error_p95", "dispersed_box_rate"]
+        self.curve, self.metrics, self.seconds = [], {}, 0.0
+
+    def _on_training_start(self):
+        self.began = time.process_time()
+
+    def _on_step(self):
+        return True
+
+    def _on_rollout_start(self):
+        if self.num_timesteps >= self.samples * (len(self.curve) + 1) / PARTS:
+            self.evaluate()
+
+    def _on_training_end(self):
+        self.evaluate()
+
+    def evaluate(self):
+        self.seconds += time.process_time() - self.began
+        flown = make_policy(self.model, self.training_env)
+        self.metrics, _ = evaluate.evaluate(self.env_id, flown, 0, 1000, **self.env_options)
+        point = {"samples": self.num_timesteps, "minutes": self.seconds / 60}
+        self.curve.append(point | {key: self.metrics[key] for key in self.keys if key in self.metrics})
+        print(json.dumps(self.curve[-1]), flush=True)
+        self.began = time.process_time()
+
+
+def make_policy(model, normalised):
     """The mean action of (obs (N, obs), t) in NumPy, as `evaluate.evaluate` flies it."""
-    state = [None]
+    seen = normalised.venv if isinstance(normalised.venv, OurFeatures) else lambda obs: obs
+    state = None  # of an LSTM
 
     def policy(obs, t):
-        if t == 0:
-            state[0] = None
+        nonlocal state
+        inputs = normalised.normalize_obs(seen(obs.astype(np.float32)))
         begins = np.full(len(obs), t == 0)
-        action, state[0] = model.predict(inputs(obs), state[0], begins, deterministic=True)
+        action, state = model.predict(inputs, state if t else None, begins, deterministic=True)
         return action
 
     return policy
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--env-id", default="DoubleIntegrator-v0", choices=[*envs.PROBLEMS, *envs.ROCKETS])
-    parser.add_argument("--samples", type=int, default=2_560_000)
-    parser.add_argument("--features", default="ours", choices=["ours", "raw"])
-    parser.add_argument("--recurrent", action="store_true", help="an LSTM: sb3-contrib's RecurrentPPO")
-    parser.add_argument("--dispersion", type=float, default=0.0, help="every flight another vehicle (a rocket's)")
-    parser.add_argument("--noise", default="learned", choices=["learned", "schedule"], help="who sets the log-std")
-    parser.add_argument("--num-envs", type=int, default=32)
-    parser.add_argument("--batch-size", type=int, default=64)
-    parser.add_argument("--epochs", type=int, default=10)
-    parser.add_argument("--learning-rate", type=float, default=3e-4, help="falls linearly to zero")
-    parser.add_argument("--gamma", type=float, default=0.99)
-    parser.add_argument("--gae-lambda", type=float, default=0.95)
-    parser.add_argument("--width", type=int, default=64, help="of the two hidden layers, and of the LSTM")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--eval-seed", type=int, default=0)
-    parser.add_argument("--start", help="begin with this .zip and the .pkl beside it")
-    parser.add_argument("--save", help="write the policy as this .zip and its VecNormalize as .pkl beside it")
-    parser.add_argument("--json", help="write the figures there")
-    options = parser.parse_args()
-    torch.set_num_threads(1)
-
-    env_id, rocket = options.env_id, options.env_id in envs.ROCKETS
-    script = next(s for s in map(importlib.import_module, SCRIPTS) if env_id in s.ENV_IDS)
-    args = script.Args(env_id=env_id, dispersion=options.dispersion) if rocket else script.Args(env_id=env_id)
-    env_options = {name: getattr(args, name) for name in script.ENV_OPTIONS}
-    batch = gym.make_vec(env_id, num_envs=options.num_envs, **env_options)
-    venv = VecMonitor(NativeVecEnv(batch))
-    ours = OurFeatures(venv, script, env_id) if options.features == "ours" else None
-    if options.start:
-        normalised = VecNormalize.load(Path(options.start).with_suffix(".pkl"), ours or venv)
-    else:
-        normalised = VecNormalize(ours or venv, gamma=options.gamma, clip_reward=np.inf)
+def make_model(options, script, args, normalised, steps):
+    """The library's learner with our first mean action and its noise, or with the parameters of --start."""
     kind, policy = (RecurrentPPO, "MlpLstmPolicy") if options.recurrent else (PPO, "MlpPolicy")
-    network = {"net_arch": [options.width] * 2, "log_std_init": args.log_std}
-    if options.recurrent:
-        network["lstm_hidden_size"] = options.width
+    width = {"lstm_hidden_size": 64} if options.recurrent else {}
     model = kind(
         policy,
         normalised,
         learning_rate=lambda left: options.learning_rate * left,
-        n_steps=batch.unwrapped.episode_steps,
+        n_steps=steps,
         batch_size=options.batch_size,
         n_epochs=options.epochs,
         gamma=options.gamma,
-        gae_lambda=options.gae_lambda,
-        policy_kwargs=network,
+        policy_kwargs={"net_arch": [64, 64], "log_std_init": args.log_std, **width},
         seed=options.seed,
         device="cpu",
     )
     model.policy.action_net.bias.data = torch.tensor(script.INITIAL_ACTION)
     if options.start:
         model.set_parameters(options.start)
-    model.total_samples = options.samples
+    return model
 
-    def inputs(obs):
-        obs = obs.astype(np.float32)
-        return normalised.normalize_obs(ours(obs) if ours else obs)
 
-    kinds = {"dispersed_error_median", "dispersed_error_p95", "dispersed_box_rate"} if options.dispersion else set()
-    kinds |= {"error_norm", "mass_ratio"} if rocket else {"ratio_of_sums", "ratio_p95", "hit_rate"}
-    curve = []
+def parse_args():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--env-id", default="DoubleIntegrator-v0", choices=[*envs.PROBLEMS, *envs.ROCKETS])
+    parser.add_argument("--samples", type=int, default=2_560_000)
+    parser.add_argument("--features", default="ours", choices=["ours", "raw"])
+    parser.add_argument("--recurrent", action="store_true", help="an LSTM: sb3-contrib's RecurrentPPO")
+    parser.add_argument("--dispersion", type=float, default=0.0, help="every flight another vehicle (a rocket's)")
+    parser.add_argument("--num-envs", type=int, default=32)
+    parser.add_argument("--batch-size", type=int, default=64)
+    parser.add_argument("--epochs", type=int, default=10)
+    parser.add_argument("--learning-rate", type=float, default=3e-4, help="falls linearly to zero")
+    parser.add_argument("--gamma", type=float, default=0.99)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--start", type=Path, help="begin with this .zip and the .pkl beside it")
+    parser.add_argument(
+        "--save", type=Path, help="write the policy as this .zip and its VecNormalize as .pkl beside it"
+    )
+    parser.add_argument("--json", type=Path, help="write the figures there")
+    options = parser.parse_args()
+    if options.dispersion and options.env_id not in envs.ROCKETS:
+        parser.error(f"--dispersion {options.dispersion}: only a rocket has it, not {options.env_id}")
+    for path in (options.start, options.start and options.start.with_suffix(".pkl")):
+        if path and not path.is_file():
+            parser.error(f"--start {options.start}: there is no {path}")
+    for path in (options.save, options.json):
+        if path and not path.parent.is_dir():
+            parser.error(f"{path}: its folder must exist")
+    return options
 
-    class Evaluation(BaseCallback):
-        """Stops the clock, evaluates after each part."""
 
-        seconds, began = 0.0, 0.0
+def main():
+    options = parse_args()
+    torch.set_num_threads(1)
+    script = next(s for s in map(importlib.import_module, SCRIPTS) if options.env_id in s.ENV_IDS)
+    args = script.Args(env_id=options.env_id)
+    env_options = {name: getattr(args, name) for name in script.ENV_OPTIONS}
+    if options.dispersion:
+        args.dispersion = env_options["dispersion"] = options.dispersion
 
-        def _on_training_start(self):
-            self.began = time.process_time()
+    batch = gym.make_vec(options.env_id, num_envs=options.num_envs, **env_options).unwrapped
+    venv = VecMonitor(NativeVecEnv(batch))
+    if options.features == "ours":
+        venv = OurFeatures(venv, script, options.env_id)
+    if options.start:
+        normalised = VecNormalize.load(options.start.with_suffix(".pkl"), venv)
+    else:
+        normalised = VecNormalize(venv, gamma=options.gamma, clip_reward=np.inf)
 
-        def _on_step(self):
-            return True
-
-        def _on_rollout_start(self):
-            if self.num_timesteps >= options.samples * (len(curve) + 1) / PARTS:
-                self.evaluate()
-
-        def _on_training_end(self):
-            self.evaluate()
-
-        def evaluate(self):
-            self.seconds += time.process_time() - self.began
-            flown = make_policy(model, inputs)
-            metrics, _ = evaluate.evaluate(env_id, flown, options.eval_seed, 1000, **env_options)
-            curve.append({"samples": self.num_timesteps, "minutes": self.seconds / 60} | {k: metrics[k] for k in kinds})
-            self.metrics = metrics
-            print(json.dumps(curve[-1]), flush=True)
-            self.began = time.process_time()
-
-    evaluation = Evaluation()
-    model.learn(options.samples, callback=[OurCurriculum(script, args, batch.unwrapped, options.noise), evaluation])
+    model = make_model(options, script, args, normalised, batch.episode_steps)
+    evaluation = Evaluation(options.env_id, env_options, options.samples)
+    model.learn(options.samples, callback=[OurCurriculum(script, args, batch, options.samples), evaluation])
     print(evaluate.table(evaluation.metrics))
     if options.save:
         model.save(options.save)
-        normalised.save(Path(options.save).with_suffix(".pkl"))
+        normalised.save(options.save.with_suffix(".pkl"))
     if options.json:
-        Path(options.json).write_text(json.dumps({"curve": curve, "final": evaluation.metrics}, indent=1) + "\n")
+        options.json.write_text(json.dumps({"curve": evaluation.curve, "final": evaluation.metrics}, indent=1) + "\n")
 
 
 if __name__ == "__main__":
