@@ -537,39 +537,6 @@ def rocket_remarks(metrics: dict, mission: envs.Mission) -> list[str]:
     return [*lines, f"  Opponent, open loop: the optimum's pitch (and yaw) at nine times, interpolated: {opponent}"]
 
 
-def rocket_seed_lines(runs: list[dict]) -> list[str]:
-    """`seed_lines` of two or more rocket runs: error and mass of each, and medians and ranges."""
-    lines = []
-    for run in runs:
-        ratio = f"{run['mass_ratio']:.4f} of the optimum's"
-        if "mass_ratio_reached" in run:
-            ratio = f"{run['mass_ratio_reached']:.4f} of the optimum's for the orbit reached"
-        mass = f"final mass {run['final_mass_kg']:.2f} kg ({ratio})"
-        lines.append(f"  seed {run['seed']}: ||error|| {run['error_norm']:.6f}, {mass}")
-    errors, masses = ([run[key] for run in runs] for key in ("error_norm", "final_mass_kg"))
-    spread = f"median ||error|| {np.median(errors):.6f}, {min(errors):.6f} to {max(errors):.6f}"
-    mass = f"median final mass {np.median(masses):.2f} kg, {min(masses):.2f} to {max(masses):.2f}"
-    return [*lines, f"  {len(runs)} seeds: {spread}; {mass}", *dispersed_seed_lines(runs)]
-
-
-def dispersed_seed_lines(runs: list[dict]) -> list[str]:
-    """Of the runs that were also flown dispersed: the spread of each, and of several medians and ranges."""
-    runs = [run for run in runs if "dispersed_perigee_error_std_km" in run]
-    lines = []
-    for run in runs:
-        flights = f"{run['dispersed_starts']} flights at dispersion {run['dispersion']:g}"
-        errors = f"||error|| median {run['dispersed_error_median']:.6f}, p95 {run['dispersed_error_p95']:.6f}"
-        perigee = " ± ".join(f"{run[f'dispersed_perigee_error_{part}_km']:.2f}" for part in ("mean", "std"))
-        ends = f"perigee {perigee} km off, {run['dispersed_box_rate']:.1%} in the box"
-        lines.append(f"  seed {run['seed']}, {flights}: {errors}; {ends}, {run['dispersed_mass_mean_kg']:.2f} kg")
-    if len(runs) > 1:
-        medians, rates = ([run[f"dispersed_{key}"] for run in runs] for key in ("error_median", "box_rate"))
-        spread = f"median of the medians {np.median(medians):.6f}, {min(medians):.6f} to {max(medians):.6f}"
-        box = f"in the box {np.median(rates):.1%}, {min(rates):.1%} to {max(rates):.1%}"
-        lines.append(f"  {len(runs)} seeds, dispersed: {spread}; {box}")
-    return lines
-
-
 # ---------------------------------------------------------------------------------------------------------------------
 # Dispersed flights: every one has its own vehicle and air, so that a policy is measured by statistics
 # ---------------------------------------------------------------------------------------------------------------------
@@ -762,19 +729,43 @@ def animate(folder) -> Path:
     return animation.write(folder / "figures", arrays, metrics)
 
 
+SEED_ROWS = {  # key of eval.json -> its row in the table of a folder's seeds
+    "ratio_of_sums": ("ratio of sums", ".4f"),
+    "ratio_mean": ("mean ratio", ".4f"),
+    "ratio_median": ("median ratio", ".4f"),
+    "ratio_p95": ("p95", ".4f"),
+    "loss_near_origin_mean": ("mean loss near the origin", ".4f"),
+    "hit_rate": ("starts that hit every circle", ".1%"),
+    "error_norm": ("||error||", ".6f"),
+    "perigee_km": ("perigee (km)", ".2f"),
+    "apogee_km": ("apogee (km)", ".2f"),
+    "max_altitude_km": ("highest (km)", ".1f"),
+    "min_altitude_after_300s_km": ("lowest after 300 s (km)", ".1f"),
+    "final_mass_kg": ("final mass (kg)", ".2f"),
+    "mass_ratio": ("mass / optimum's", ".4f"),
+    "mass_ratio_reached": ("mass / optimum's for the orbit reached", ".4f"),
+    "dispersed_error_median": ("dispersed: ||error||, median", ".6f"),
+    "dispersed_error_p95": ("dispersed: ||error||, p95", ".6f"),
+    "dispersed_perigee_error_mean_km": ("dispersed: perigee off, mean (km)", ".2f"),
+    "dispersed_perigee_error_std_km": ("dispersed: perigee off, sigma (km)", ".2f"),
+    "dispersed_box_rate": ("dispersed: in the box", ".1%"),
+    "dispersed_mass_mean_kg": ("dispersed: final mass, mean (kg)", ".2f"),
+    "training_seconds": ("seconds of training", ".0f"),
+}
+
+
 def seed_lines(folder) -> list[str]:
-    """One line a seed of a results folder with its ratio of sums, and their median and range; none for one seed."""
+    """A table of a results folder's seeds with their medians and ranges, a row each figure; none for one seed."""
     runs = sorted((read_json(path) for path in (Path(folder) / "seeds").glob("*.json")), key=lambda run: run["seed"])
     if len(runs) < 2:
         return []
-    if runs[0]["env_id"] in envs.ROCKETS:
-        return rocket_seed_lines(runs)
-    lines = []
-    for run in runs:
-        ratio = f"{run['ratio_of_sums']:.4f}" if "ratio_of_sums" in run else "none"
-        lines.append(f"  seed {run['seed']}: ratio of sums {ratio}, hit rate {run['hit_rate']:.1%}")
-    if ratios := [run["ratio_of_sums"] for run in runs if "ratio_of_sums" in run]:
-        lines.append(f"  {len(ratios)} seeds: median {np.median(ratios):.4f}, {min(ratios):.4f} to {max(ratios):.4f}")
+    heads = [*(f"seed {run['seed']}" for run in runs), "median", "lowest", "highest"]
+    lines = [f"{'':40}" + "".join(f"{head:>10}" for head in heads)]
+    for key, (label, form) in SEED_ROWS.items():
+        if values := [run[key] for run in runs if key in run]:
+            cells = [format(run[key], form) if key in run else "-" for run in runs]
+            cells += [format(value, form) for value in (np.median(values), min(values), max(values))]
+            lines.append(f"  {label:38}" + "".join(f"{cell:>10}" for cell in cells))
     return lines
 
 

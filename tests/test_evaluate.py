@@ -530,7 +530,9 @@ def test_publish_ships_the_first_seed_and_adds_the_second(tmp_path, monkeypatch,
     assert {str(name) for name in after} == names | {"seeds/2.json", "seeds/2.csv"}
     assert {name: after[name] for name in files} == files
     printed = command_line(monkeypatch, capsys, "figures", results)
-    assert "seed 1: ratio" in printed and "seed 2: ratio" in printed and "2 seeds: median" in printed
+    (row,) = (line for line in printed.splitlines() if line.startswith("  ratio of sums") and len(line.split()) == 8)
+    one, two, median, lowest, highest = map(float, row.split()[3:])
+    assert (lowest, highest) == (min(one, two), max(one, two)) and median == pytest.approx((one + two) / 2, abs=1e-4)
     assert snapshot(results)[Path("figures/training.png")] != files[Path("figures/training.png")]
     assert (results / "agent.safetensors").read_bytes() == b"weights of seed 1"
 

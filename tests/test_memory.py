@@ -1,6 +1,7 @@
 """`benchmarks/attention.py` and `benchmarks/memory.py`: the weights against the network's own output, the tables."""
 
 import json
+import os
 import shlex
 import sys
 from pathlib import Path
@@ -89,16 +90,17 @@ def evaluations(folder, values):
 
 
 def test_table_and_figure_of_what_is_there(tmp_path, monkeypatch, capsys):
-    evaluations(tmp_path / "hidden_velocity" / "memory_4", [1.5, 1.25, 3.0])
-    evaluations(tmp_path / "hidden_velocity" / "shown", [1.005])
-    monkeypatch.setattr(sys, "argv", ["memory.py", str(tmp_path)])
+    folder = tmp_path / "results" / "memory"
+    evaluations(folder / "hidden_velocity" / "memory_4", [1.5, 1.25, 3.0])
+    evaluations(tmp_path / "results" / "di", [1.005])
+    monkeypatch.setattr(sys, "argv", ["memory.py", str(folder)])
     memory.main()
     title, header, *rows = capsys.readouterr().out.splitlines()
     assert "velocity hidden" in title and header.split()[:2] == ["seeds", "ratio"]
     assert rows[0].split("  ")[1:] and "L_mem 4" in rows[0] and "1.5 (1.25 to 3)" in rows[0] and " 3 " in rows[0]
     assert "velocity shown" in rows[1] and "1.005" in rows[1] and "-" in rows[1]
     assert "no memory can beat" in rows[2] and len(rows) == 3
-    assert imread(tmp_path / "memory.png").std() > 0.05
+    assert imread(folder / "memory.png").std() > 0.05
 
 
 def test_what_no_memory_can_beat_is_the_best_of_first_actions_that_see_the_position_alone():
@@ -135,7 +137,7 @@ def nominal_flags():
 
 def test_every_row_of_the_tables_has_its_three_jobs(tmp_path):
     """Seeds 1 to 3 of each, by one command that differs from its neighbours by what the row says alone."""
-    lists = ("memory_di_jobs.txt", "memory_rocket_jobs.txt")
+    lists = ("memory_di_jobs.txt", "memory_rocket_jobs.txt", "result_jobs.txt")
     text, nominal = "\n".join((ROOT / "benchmarks" / name).read_text() for name in lists), nominal_flags()
     assert len(nominal) == len(memory.EXPERIMENTS["rocket"].rows)
     for checkpoint, flags in nominal.items():
@@ -143,16 +145,17 @@ def test_every_row_of_the_tables_has_its_three_jobs(tmp_path):
         text = text.replace(f"--checkpoint {checkpoint}", flags)
     (tmp_path / "jobs.txt").write_text(text)
     jobs = run_seeds.read_jobs(tmp_path / "jobs.txt")
+    found = []
     for name, experiment in memory.EXPERIMENTS.items():
         for row in experiment.rows:
-            seeds = [job.args["seed"] for job in jobs if job.results == Path("results/memory", name, row)]
-            assert sorted(seeds) == [1, 2, 3], (name, row)
-    assert len(jobs) == sum(3 * len(experiment.rows) for experiment in memory.EXPERIMENTS.values())
+            mine = [job for job in jobs if job.results == Path(os.path.normpath(f"results/memory/{name}/{row}"))]
+            assert sorted(job.args["seed"] for job in mine)[:3] == [1, 2, 3], (name, row)
+            found += [(name, row, job) for job in mine]
+    assert sum(job.results.is_relative_to("results/memory") for job in jobs) == 3 * 15
     hidden = {"rocket": None, "hidden_phase": "observe_phase", "hidden_velocity": "observe_velocity"}
-    for job in jobs:
-        _, _, name, row = job.results.parts
+    for name, row, job in found:
         if row.startswith("memory_"):
             assert job.args["memory_length"] == int(row.removeprefix("memory_"))
         if hidden[name]:
-            assert job.args[hidden[name]] == (row == "shown"), shlex.join(job.command)
+            assert job.args[hidden[name]] == row.startswith(".."), shlex.join(job.command)
     assert all(job.args["num_blocks"] == 0 for job in jobs if job.results.name == "mlp")
