@@ -703,11 +703,12 @@ def guidance_reward(u, up, along, pitch, weight):
 
 
 def penalties(mission: Mission, altitude, time, turn, burnt, left, mass_weight):
-    """R_penalties = -40 c - 0.024 o - 0.024 s - 0.001 |u_t - u_{t-1}| - w_m (b + c l) / mass_unit.
+    """R_penalties = -40 c (2 - t / t_end) - 0.024 o - 0.024 s - 0.001 |u_t - u_{t-1}| - w_m (b + c l) / mass_unit.
 
-    c = 1[h < 0], a crash, which must cost more than the worst miss; o = clip((h + 5 km - ceiling) / 100 km, 0, 1),
+    c = 1[h < 0], a crash, which must cost more than the worst miss, and the more the earlier: from a policy whose
+    flights all crash the way back leads through later crashes. o = clip((h + 5 km - ceiling) / 100 km, 0, 1),
     overshoot; s = clip((floor - h) / 30 km, 0, 1) late in the flight, a dip into the air at orbital speed; b (kg), the
-    propellant that a step of the last phase burns, l, what a crash leaves of it. Altitude h (m), time (s): the step's
+    propellant that a step of the last phase burns, l, what a crash leaves of it. Altitude h (m), time t (s): the step's
     end's. Ceiling, floor (110 km), what is late (after 300 s) and mass_unit (the paper's rocket: 100 kg) are the
     mission's.
 
@@ -718,7 +719,8 @@ def penalties(mission: Mission, altitude, time, turn, burnt, left, mass_weight):
     overshoot = np.minimum(np.maximum((altitude - (mission.ceiling - 5e3)) / 100e3, 0.0), 1.0)
     sag = np.minimum(np.maximum((1e3 * mission.floor_km - altitude) / 30e3, 0.0), 1.0) * (time > mission.late)
     mass_unit = mission.mass_unit or 0.015 * mission.rocket.dry_mass
-    return -40.0 * crash - 0.024 * (overshoot + sag) - 0.001 * turn - mass_weight * (burnt + crash * left) / mass_unit
+    crashed = -40.0 * crash * (2 - time / mission.rocket.end_time)
+    return crashed - 0.024 * (overshoot + sag) - 0.001 * turn - mass_weight * (burnt + crash * left) / mass_unit
 
 
 TERMINAL_SCALE = 0.005  # of the reported R_terminal

@@ -290,7 +290,9 @@ def test_hyperbola_has_no_apogee(hyperbolic, tmp_path):
 def test_crash(crashed):
     metrics, arrays = crashed
     assert metrics.keys() == KEYS - {"min_altitude_after_300s_km"}
-    assert metrics["crashed"] and not metrics["success"] and metrics["R_penalties"] == pytest.approx(-40)
+    assert (
+        metrics["crashed"] and not metrics["success"] and metrics["R_penalties"] == pytest.approx(-80, abs=1)
+    )  # at once
     assert norm(arrays["y"][-1, :3]) < RE and metrics["perigee_km"] < -6000
     table = evaluate.table(metrics)
     assert "crashed" in table and "nan" not in table and "inf" not in table
@@ -418,9 +420,8 @@ def test_texts_lead_with_the_mass_for_the_orbit_reached(flown, crashed, tmp_path
     (tmp_path / "seeds").mkdir()
     for seed, run in ((1, metrics), (2, flown[CUTOFF][0])):
         evaluate.write_json(tmp_path / "seeds" / f"{seed}.json", run | {"seed": seed})
-    first, second, _ = evaluate.seed_lines(tmp_path)
-    assert first.endswith("(0.9877 of the optimum's for the orbit reached)")
-    assert second.endswith(f"({metrics['mass_ratio']:.4f} of the optimum's)")
+    (line,) = (line for line in evaluate.seed_lines(tmp_path) if "for the orbit reached" in line)
+    assert line.split()[-5:] == ["0.9877", "-", "0.9877", "0.9877", "0.9877"]  # seed 1, seed 2, median, range
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -584,10 +585,11 @@ def test_publish_and_figures(flown, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(evaluate, "redraw", lambda folder: [folder / "figures" / "orbit.png"])  # drawn above
     printed = command_line(monkeypatch, capsys, "figures", results)
     error, mass = (flown[CUTOFF][0][key] for key in ("error_norm", "final_mass_kg"))
-    assert f"seed 1: ||error|| {error:.6f}, final mass {mass:.2f} kg" in printed
-    assert "seed 2: ||error|| 0.500000, final mass 6000.00 kg (0.8000 of the optimum's)" in printed
-    assert f"2 seeds: median ||error|| {(error + 0.5) / 2:.6f}, {error:.6f} to 0.500000" in printed
-    assert f"median final mass {(mass + 6000) / 2:.2f} kg, 6000.00 to {mass:.2f}" in printed
+    rows = {line[:40].strip(): line[40:].split() for line in printed.splitlines()}
+    assert rows[""][-7:] == ["seed", "1", "seed", "2", "median", "lowest", "highest"]
+    found = [float(cell) for cell in rows["||error||"]]
+    assert found == pytest.approx([error, 0.5, (error + 0.5) / 2, error, 0.5], abs=1e-6)
+    assert rows["final mass (kg)"] == [f"{x:.2f}" for x in (mass, 6000, (mass + 6000) / 2, 6000, mass)]
 
 
 def test_refused_publishing(flown, tmp_path, monkeypatch, capsys):

@@ -50,7 +50,7 @@ def expected_parts(v, seen, u, final, mass_weight, trajectory_weight, guidance_w
             pitch = math.radians(np.interp(begin, *knots))
             up, along, _ = v.up_along_cross(before)
             parts[k, 2] = -guidance_weight * (1 - u[k] @ (math.sin(pitch) * up + math.cos(pitch) * along))
-        parts[k, 3] -= 40 * (altitude < 0)
+        parts[k, 3] -= 40 * (altitude < 0) * (2 - end / v.end)
         parts[k, 3] -= 0.024 * min(max((altitude - v.ceiling + 5e3) / 100e3, 0), 1)
         if end > 300:
             parts[k, 3] -= 0.024 * min(max((110e3 - altitude) / 30e3, 0), 1)
@@ -153,7 +153,8 @@ def test_reward_functions_at_points_computed_by_hand():
         assert got[0] == pytest.approx(expected, abs=1e-15)
     hand = [  # altitude, time, turn, burnt, left, mass weight; value
         ((200e3, 500, 0.0, 0.0, 9e3, 0.0), 0.0),
-        ((-1.0, 10, 0.0, 0.0, 9e3, 0.0), -40.0),
+        ((-1.0, 96.1, 0.0, 0.0, 9e3, 0.0), -76.0),
+        ((-1.0, 961.0, 0.0, 0.0, 9e3, 0.0), -40.024),
         ((0.0, 10, 0.0, 0.0, 9e3, 1.0), 0.0),
         ((245e3, 500, 0.0, 0.0, 9e3, 0.0), 0.0),
         ((295e3, 100, 0.0, 0.0, 9e3, 0.0), -0.012),
@@ -161,12 +162,12 @@ def test_reward_functions_at_points_computed_by_hand():
         ((95e3, 500, 0.0, 0.0, 9e3, 0.0), -0.012),
         ((95e3, 300, 0.0, 0.0, 9e3, 0.0), 0.0),
         ((50e3, 302, 0.0, 0.0, 9e3, 0.0), -0.024),
-        ((-1.0, 500, 2.0, 50.0, 1e3, 0.4), -40 - 0.024 - 0.002 - 0.2 - 4),
+        ((-1.0, 480.5, 2.0, 50.0, 1e3, 0.4), -60 - 0.024 - 0.002 - 0.2 - 4),
         ((200e3, 500, 0.5, 48.0, 1e3, 1.0), -0.0005 - 0.48),
     ]
     columns = [np.array(column) for column in zip(*(arguments for arguments, _ in hand))]
     got = penalties(PAPER_MISSION, *columns)
-    np.testing.assert_allclose(got, [value for _, value in hand], rtol=0, atol=1e-15)
+    np.testing.assert_allclose(got, [value for _, value in hand], rtol=0, atol=1e-14)
     logs = [0, -2 * math.log(2), -2 * math.log(100)]
     np.testing.assert_allclose(terminal_reward(np.array([0.0, 0.005, 0.495])), logs)
     np.testing.assert_allclose(terminal_reward(np.array([0.0, 0.001, 0.099]), 0.001), logs)
@@ -178,10 +179,10 @@ def test_reward_functions_at_points_computed_by_hand():
 def test_penalties_are_the_missions_by_hand():
     """No ceiling: no altitude is too high. A mass unit of its own, or 1.5 % of the dry mass; another floor, late."""
     rows, mission = [(400e3, 500, 0, 0, 0, 1), (4e7, 500, 0, 36.0, 0, 1), (-1, 9, 0, 0, 72, 2)], ROCKETS[LEO]
-    args = [np.array(column) for column in zip(*rows)]
-    np.testing.assert_allclose(penalties(mission, *args), [0, -0.1, -40 - 2 * 72 / 360], rtol=0, atol=1e-15)
+    args, crash = [np.array(column) for column in zip(*rows)], -40 * (2 - 9 / mission.rocket.end_time)
+    np.testing.assert_allclose(penalties(mission, *args), [0, -0.1, crash - 2 * 72 / 360], rtol=0, atol=1e-15)
     own = Mission(mission.rocket, ceiling_km=420.0, mass_unit=72.0, floor_km=80.0, late=100.0)
-    np.testing.assert_allclose(penalties(own, *args), [0, -0.024 - 0.5, -40 - 2], rtol=0, atol=1e-15)
+    np.testing.assert_allclose(penalties(own, *args), [0, -0.024 - 0.5, crash - 2], rtol=0, atol=1e-15)
     height, time = np.array([465e3, 415e3, 65e3, 65e3, 85e3]), np.array([99.0, 99.0, 99.0, 101.0, 101.0])
     got = penalties(own, height, time, 0.0, 0.0, 0.0, 0.0)
     np.testing.assert_allclose(got, [-0.012, 0, 0, -0.012, 0], rtol=0, atol=1e-15)
