@@ -14,7 +14,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Rectangle
-from matplotlib.ticker import EngFormatter
+from matplotlib.ticker import EngFormatter, NullFormatter
 from PIL import Image
 
 import envs
@@ -95,16 +95,23 @@ def rocket_headline(metrics: dict) -> str:
 
 
 def draw_training(curves: list[dict], metrics: dict) -> Figure:
-    """Reward, policy loss and total loss over the samples; with several seeds each thin and their median thick."""
+    """Reward, policy loss, total loss and the mean action's miss over the samples.
+
+    With several seeds each is thin and their median thick. The miss is ||error|| or the cost over the optimum's less 1.
+    """
     panels = {"charts/episodic_return": "episodic return", "losses/policy_loss": "policy loss"}
     panels["losses/total_loss"] = "total loss"
     if any("eval/error_norm" in curve for curve in curves):
         panels["eval/error_norm"] = "$\\Vert$error$\\Vert$ of the mean action"
+    elif any("eval/ratio_of_sums" in curve for curve in curves):
+        panels["eval/ratio_of_sums"] = "cost / optimum's, less 1, mean action"
     figure = Figure(figsize=(4 * len(panels), 3.8), layout="constrained")
     seeds = f", {len(curves)} seeds" if len(curves) > 1 else ""
     figure.suptitle(f"{headline(metrics)}{seeds}")
     for ax, (tag, label) in zip(figure.subplots(1, len(panels)), panels.items()):
         logged = [curve[tag] for curve in curves if tag in curve]
+        if tag == "eval/ratio_of_sums":
+            logged = [(steps, ratios - 1) for steps, ratios in logged]
         if len(logged) > 1:
             for k, (steps, values) in enumerate(logged):
                 ax.plot(steps, values, color="tab:red", linewidth=0.7, alpha=0.4, label="" if k else "each seed")
@@ -118,9 +125,27 @@ def draw_training(curves: list[dict], metrics: dict) -> Figure:
         ax.xaxis.set_major_formatter(EngFormatter(sep=""))
         ax.set(xlabel="environment steps", ylabel=label)
         ax.grid(alpha=0.3)
-        if metrics["env_id"] in envs.ROCKETS and logged:
-            scale_rocket_panel(ax, tag, np.concatenate([values for _, values in logged]))
+        if logged:
+            scale_panel(ax, tag, np.concatenate([values for _, values in logged]))
     return figure
+
+
+def scale_panel(ax, tag: str, values: np.ndarray):
+    """The y axis of a training panel: a miss in log scale; the rest without the few updates that would dominate it."""
+    if tag == "eval/error_norm":
+        ax.set_yscale("log")
+        line = ax.axhline(SUCCESS, **{**TARGET, "linestyle": "--"}, label=f"success: below {SUCCESS}")
+        ax.legend(handles=[line], loc="upper right")
+    elif tag == "eval/ratio_of_sums":
+        ax.set_yscale("log")
+    else:
+        low, high = np.percentile(values, [5, 95])
+        span = high - low
+        inside = values[(values >= low - span) & (values <= high + span)]
+        if len(inside) < len(values):
+            margin = 0.05 * np.ptp(inside)
+            ax.set_ylim(inside.min() - margin, inside.max() + margin)
+            ax.set_title(f"cut; all values: {values.min():.3g} to {values.max():.3g}", fontsize=9)
 
 
 def median_curve(curves: list[tuple]) -> tuple[np.ndarray, np.ndarray]:
@@ -258,6 +283,7 @@ def draw_cost_error(arrays: dict, metrics: dict) -> Figure:
     over_distance.axvline(NEAR_ORIGIN, color="k", linewidth=1.0, label=label)
     over_distance.set(xlabel="distance of the start from the origin $|x_0|$", ylabel="cost")
     over_distance.set(title="Loss beside the optimum: where they meet, $J = 2 J^*$")
+    over_distance.xaxis.set_minor_formatter(NullFormatter())  # its labels overlap
     over_distance.legend(loc="upper left")
     over_distance.grid(alpha=0.3)
     figure.suptitle(headline(metrics))
@@ -273,22 +299,6 @@ OURS, BEST = {**POLICY, "linewidth": 2.2}, {**OPTIMUM, **DASHED}
 # velocities share a panel with positions: the same widths and dashes, paler
 VELOCITY = {**OURS, "color": "lightcoral"}, {**BEST, "color": "deepskyblue", "alpha": 0.6}
 FLIGHTS = {"": OURS, "_reference": BEST}  # by the suffix of their arrays
-
-
-def scale_rocket_panel(ax, tag: str, values: np.ndarray):
-    """The y axis of a training panel: the error in log scale; a loss without the few updates that would dominate it."""
-    if tag == "eval/error_norm":
-        ax.set_yscale("log")
-        line = ax.axhline(SUCCESS, **{**TARGET, "linestyle": "--"}, label=f"success: below {SUCCESS}")
-        ax.legend(handles=[line], loc="upper right")
-    elif tag.startswith("losses/"):
-        low, high = np.percentile(values, [5, 95])
-        span = high - low
-        inside = values[(values >= low - span) & (values <= high + span)]
-        if len(inside) < len(values):
-            margin = 0.05 * np.ptp(inside)
-            ax.set_ylim(inside.min() - margin, inside.max() + margin)
-            ax.set_title(f"cut; all values: {values.min():.3g} to {values.max():.3g}", fontsize=9)
 
 
 def draw_ascent(arrays: dict, metrics: dict) -> Figure:

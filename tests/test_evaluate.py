@@ -610,3 +610,22 @@ def test_refused_publishing_leaves_the_folder_untouched(tmp_path, monkeypatch, c
     with pytest.raises(SystemExit, match="eval.json"):
         command_line(monkeypatch, capsys, "publish", tmp_path / "eval.json", tmp_path / "new")
     assert not (tmp_path / "new").exists()
+
+
+def test_training_figure_of_a_small_problem_shows_what_the_mean_action_loses():
+    """In log scale, each seed and their median; the returns are cut where a few early updates would hide the rest."""
+    steps, update = 4000 * np.arange(1, 41), np.arange(1, 41)
+    curves = [
+        {
+            "charts/episodic_return": (steps, np.where(update < 2, -1e4, 10.0 - 10 / update)),
+            "eval/ratio_of_sums": (steps[9::10], 1 + 10.0 ** -np.arange(1, 5) * factor),
+        }
+        for factor in (1, 2, 4)
+    ]
+    metrics, _ = evaluate.evaluate(SINGLE, feedback(SINGLE, 1e3), 0, 5)
+    figure = figures.draw_training(curves, metrics)
+    returns, *_, loss = figure.axes
+    assert len(figure.axes) == 4 and loss.get_yscale() == "log" and "less 1" in loss.get_ylabel()
+    drawn = [line.get_ydata() for line in loss.lines]
+    np.testing.assert_allclose(drawn, np.outer([1, 2, 4, 2], 10.0 ** -np.arange(1, 5)), rtol=1e-9)
+    assert 4 < returns.get_ylim()[0] < 5 and "-1e+04" in returns.get_title()
