@@ -131,4 +131,4 @@ def test_the_benchmark_follows_our_curriculum():
             prices.append((batch.mass_weight, batch.flights_per_start))
 
     model.learn(64, callback=Watch(script, args, batch, 64))
-    assert prices == [(pytest.approx(np.clip((part - 0.25) / 0.35, 0, 1)), 1) for part in (0, 0.25, 0.5, 0.75)]
+    assert prices == [(pytest.approx(price), 1) for price in (0, 0, 3 * 0.25 / 0.35, 3 * (1 - 0.9 * 0.15 / 0.4))]
