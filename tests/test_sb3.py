@@ -131,5 +131,4 @@ def test_the_benchmark_follows_our_curriculum():
             prices.append((batch.mass_weight, batch.flights_per_start))
 
     model.learn(64, callback=Watch(script, args, batch, 64))
-    full = args.mass_weight * 0.005 / (0.005 + 1 / 10)  # the noise is learned from 1 on, and hardly moves in 64 samples
-    assert prices == [(pytest.approx(price, rel=1e-2), 1) for price in (0, full * 2 / 3, full, full * 5 / 8)]
+    assert prices == [(pytest.approx(price), 1) for price in (0, 0, 3 * 0.25 / 0.35, 3 * (1 - 0.9 * 0.15 / 0.4))]
