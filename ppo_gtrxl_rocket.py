@@ -169,8 +169,8 @@ def set_curriculum(envs, args, progress, refines, std):
     """What only training changes, all of it ours; returns how many flights in a row have the same start, or draw.
 
     Noise std scatters the ends of the flights by about std / 10: R_terminal need not be steeper; dispersed ones end
-    some 0.001 apart whatever the noise. Burning costs nothing in the first quarter, most at 60 %, when a low perigee may
-    even pay, a tenth of that at the end: the noise is then too small to find mass, and the orbit counts.
+    some 0.001 apart whatever the noise. Burning costs nothing in the first quarter, most at 60 %, when a low perigee
+    may even pay, a tenth of that at the end: the noise is then too small to find mass, and the orbit counts.
     """
     envs.guidance = args.guidance
     envs.terminal_scale = min(TERMINAL_SCALE, max(std / 8, 0.001 if args.dispersion else 0.0))
