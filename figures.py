@@ -14,7 +14,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Rectangle
-from matplotlib.ticker import EngFormatter, NullFormatter
+from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
 from PIL import Image
 
 import envs
@@ -283,7 +283,9 @@ def draw_cost_error(arrays: dict, metrics: dict) -> Figure:
     over_distance.axvline(NEAR_ORIGIN, color="k", linewidth=1.0, label=label)
     over_distance.set(xlabel="distance of the start from the origin $|x_0|$", ylabel="cost")
     over_distance.set(title="Loss beside the optimum: where they meet, $J = 2 J^*$")
-    over_distance.xaxis.set_minor_formatter(NullFormatter())  # its labels overlap
+    over_distance.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))  # all of a decade's labels overlap
+    over_distance.xaxis.set_major_formatter("{x:g}")
+    over_distance.xaxis.set_minor_formatter(NullFormatter())
     over_distance.legend(loc="upper left")
     over_distance.grid(alpha=0.3)
     figure.suptitle(headline(metrics))
