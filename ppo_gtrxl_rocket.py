@@ -1,7 +1,7 @@
 """PPO with a Gated Transformer-XL on a four-phase rocket ascent, measured against the true optimum in the same run.
 
-    python ppo_gtrxl_rocket.py --seed 1                                        # fixed 961 s, as in the paper
-    python ppo_gtrxl_rocket.py --seed 1 --env-id RocketAscentCutoff-v0         # free final time, most mass
+    python ppo_gtrxl_rocket.py --seed 1  # fixed 961 s, as in the paper
+    python ppo_gtrxl_rocket.py --seed 1 --env-id RocketAscentCutoff-v0 --log-std-final -6.2  # free final time, most mass
     python ppo_gtrxl_rocket.py --eval-only --checkpoint results/rocket_fixed/agent.safetensors
 
 Top to bottom: arguments, problem, Gated Transformer-XL, agent, PPO, training, main. From the first
@@ -89,7 +89,7 @@ class Args:
     lr_schedule: str = "std"  # linear, or std: --learning-rate times the policy's standard deviation
     noise: str = "schedule"  # who sets the log-std: learned (the optimiser) or schedule (linear)
     log_std: float = -1.4  # initial log of the policy's standard deviation, in the action's unit, -8 to 0.5
-    log_std_final: float = -6.2  # log-std of the last update, where it is not learned to the end
+    log_std_final: float = -5.0  # log-std of the last update, where it is not learned to the end
     flights_per_start: int = 32  # flights of each start or draw, compared with one another (1: the paper)
     refine_from: float | None = None  # part of the updates after which the refinement begins (none: never)
     log_std_refine: float | None = None  # log-std at the refinement's beginning (none: as it is)
