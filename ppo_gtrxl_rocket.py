@@ -57,7 +57,7 @@ class Args:
     observe_mass: bool = False  # show the true mass of a dispersed rocket, not the flight computer's
     action_frame: str = "local"  # the thrust direction's axes: local (up, along-track, cross-track) or eci
     guidance: str = "none"  # early reference pitch of R_guidance: none (R_guidance is 0), linear or knots
-    mass_weight: float = 3.0  # cut-off: the highest price of 100 kg (1.5 % of the dry mass) burnt in the last phase
+    mass_weight: float = 3.0  # cut-off: the highest price of a mission's mass_unit burnt in the last phase
     reward_scale: float = 0.2  # factor on the rewards in training; everything logged is unscaled
 
     # transformer (a laptop's; docs/decisions.md has Table 1's beside ours)
