@@ -277,7 +277,7 @@ class Mission:
     floor_km: float = 110.0  # altitude below which a dip is penalised once the air has been left
     late: float = 300.0  # s after which it has
     guided_until: float | None = None  # s until which R_guidance has a reference pitch (none: the first burn's end)
-    mass_unit: float | None = None  # kg whose burning --mass-weight prices (none: an eighth of the dry mass)
+    mass_unit: float | None = None  # kg whose burning --mass-weight prices (none: 7.5 % of the dry mass)
 
     @property
     def ceiling(self) -> float:
@@ -718,7 +718,7 @@ def penalties(mission: Mission, altitude, time, turn, burnt, left, mass_weight):
     crash = altitude < 0
     overshoot = np.minimum(np.maximum((altitude - (mission.ceiling - 5e3)) / 100e3, 0.0), 1.0)
     sag = np.minimum(np.maximum((1e3 * mission.floor_km - altitude) / 30e3, 0.0), 1.0) * (time > mission.late)
-    mass_unit = mission.mass_unit or mission.rocket.dry_mass / 8
+    mass_unit = mission.mass_unit or 0.075 * mission.rocket.dry_mass
     crashed = -40.0 * crash * (2 - time / mission.rocket.end_time)
     return crashed - 0.024 * (overshoot + sag) - 0.001 * turn - mass_weight * (burnt + crash * left) / mass_unit
 

@@ -178,10 +178,10 @@ def test_reward_functions_at_points_computed_by_hand():
 
 
 def test_penalties_are_the_missions_by_hand():
-    """No ceiling: no altitude is too high. A mass unit of its own, or an eighth of the dry mass; another floor, late."""
+    """No ceiling: no altitude is too high. A mass unit of its own, or 7.5 % of the dry mass; another floor, late."""
     rows, mission = [(400e3, 500, 0, 0, 0, 1), (4e7, 500, 0, 36.0, 0, 1), (-1, 9, 0, 0, 72, 2)], ROCKETS[LEO]
     args, crash = [np.array(column) for column in zip(*rows)], -40 * (2 - 9 / mission.rocket.end_time)
-    np.testing.assert_allclose(penalties(mission, *args), [0, -0.012, crash - 2 * 0.024], rtol=0, atol=1e-15)
+    np.testing.assert_allclose(penalties(mission, *args), [0, -0.02, crash - 2 * 0.04], rtol=0, atol=1e-15)
     own = Mission(mission.rocket, ceiling_km=420.0, mass_unit=72.0, floor_km=80.0, late=100.0)
     np.testing.assert_allclose(penalties(own, *args), [0, -0.024 - 0.5, crash - 2], rtol=0, atol=1e-15)
     height, time = np.array([465e3, 415e3, 65e3, 65e3, 85e3]), np.array([99.0, 99.0, 99.0, 101.0, 101.0])
