@@ -364,7 +364,6 @@ def import_vehicles():
             print(f"vehicles/{path.name} is left out: {why}", file=sys.stderr)
 
 
-# with propellant to waste a flight may stay low in the air; the optimum climbs through 160 km at 308 s
-register_rocket("RocketAscent-v0", **vars(replace(PAPER_MISSION, floor_km=160.0)))
-register_rocket("RocketAscentCutoff-v0", **vars(replace(PAPER_MISSION, cutoff=True)))
+for _env_id, _cutoff in {"RocketAscent-v0": False, "RocketAscentCutoff-v0": True}.items():
+    register_rocket(_env_id, **vars(replace(PAPER_MISSION, cutoff=_cutoff)))
 import_vehicles()

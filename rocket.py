@@ -277,7 +277,7 @@ class Mission:
     floor_km: float = 110.0  # altitude below which a dip is penalised once the air has been left
     late: float = 300.0  # s after which it has
     guided_until: float | None = None  # s until which R_guidance has a reference pitch (none: the first burn's end)
-    mass_unit: float | None = None  # kg whose burning --mass-weight prices (none: 7.5 % of the dry mass)
+    mass_unit: float | None = None  # kg whose burning --mass-weight prices (none: 6 % of the dry mass)
 
     @property
     def ceiling(self) -> float:
@@ -709,8 +709,8 @@ def penalties(mission: Mission, altitude, time, turn, burnt, left, mass_weight):
     flights all crash the way back leads through later crashes. o = clip((h + 5 km - ceiling) / 100 km, 0, 1),
     overshoot; s = clip((floor - h) / 30 km, 0, 1) late in the flight, a dip into the air at orbital speed; b (kg), the
     propellant that a step of the last phase burns, l, what a crash leaves of it. Altitude h (m), time t (s): the step's
-    end's; t_end (s) is the rocket's end_time. Ceiling, floor (110 km; at the paper's fixed time 160 km), what is late
-    (after 300 s) and mass_unit (the paper's rocket: 100 kg) are the mission's.
+    end's; t_end (s) is the rocket's end_time. Ceiling, floor (110 km), what is late (after 300 s) and mass_unit (the
+    paper's rocket: 100 kg) are the mission's.
 
     The paper names h > 0, overshoot beyond 250 km and |u_t - u_{t-1}|; the sizes, the margin that lets o begin 5 km
     below the ceiling, the dip and the price of propellant are ours.
@@ -718,7 +718,7 @@ def penalties(mission: Mission, altitude, time, turn, burnt, left, mass_weight):
     crash = altitude < 0
     overshoot = np.minimum(np.maximum((altitude - (mission.ceiling - 5e3)) / 100e3, 0.0), 1.0)
     sag = np.minimum(np.maximum((1e3 * mission.floor_km - altitude) / 30e3, 0.0), 1.0) * (time > mission.late)
-    mass_unit = mission.mass_unit or 0.075 * mission.rocket.dry_mass
+    mass_unit = mission.mass_unit or 0.06 * mission.rocket.dry_mass
     crashed = -40.0 * crash * (2 - time / mission.rocket.end_time)
     return crashed - 0.024 * (overshoot + sag) - 0.001 * turn - mass_weight * (burnt + crash * left) / mass_unit
 

@@ -189,7 +189,7 @@ TWO_STAGE = Vehicle(
     [(162.0, {"first": 1}, {"first": 1}), (555.0, {"second": 1}, {})],
     payload=20e3, area=10.5, goal=(6778145.0, 0.0, 51.6, 360 - NODE, 0.0),
     pitch=([0, 10, 40, 80, 162, 250, 350, 450, 555], [90, 88, 70, 52, 33, 26, 15, 4, -6]),
-    ceiling=math.inf, guided_until=162.0, mass_unit=1800.0,
+    ceiling=math.inf, guided_until=162.0, mass_unit=1440.0,
 )  # fmt: skip
 VEHICLES = {FIXED: PAPER, CUTOFF: PAPER, LEO_FIXED: TWO_STAGE, LEO: TWO_STAGE}
 both = pytest.mark.parametrize("v", [PAPER, TWO_STAGE], ids=repr)

@@ -209,7 +209,7 @@ def test_one_burn():
     assert flight["R_trajectory"] == 0, "every burn is the last"
     burnt, dry = 2 * 36500 / 250, 3500.0
     energy = env.unwrapped._parts[3, 0]
-    assert energy == pytest.approx(-burnt / (0.075 * dry))
+    assert energy == pytest.approx(-burnt / (0.06 * dry))
     assert flight["final_mass_kg"] == pytest.approx(3500 if flight["final_time_s"] == 250 else flight["final_mass_kg"])
 
 
