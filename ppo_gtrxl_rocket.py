@@ -1,7 +1,7 @@
 """PPO with a Gated Transformer-XL on a four-phase rocket ascent, measured against the true optimum in the same run.
 
     python ppo_gtrxl_rocket.py --seed 1  # fixed 961 s, as in the paper
-    python ppo_gtrxl_rocket.py --seed 1 --env-id RocketAscentCutoff-v0 --log-std-final -6.2  # free final time, most mass
+    python ppo_gtrxl_rocket.py --seed 1 --env-id RocketAscentCutoff-v0 --log-std-final -6.2  # free final time
     python ppo_gtrxl_rocket.py --eval-only --checkpoint results/rocket_fixed/agent.safetensors
 
 Top to bottom: arguments, problem, Gated Transformer-XL, agent, PPO, training, main. From the first
