@@ -709,8 +709,8 @@ def penalties(mission: Mission, altitude, time, turn, burnt, left, mass_weight):
     flights all crash the way back leads through later crashes. o = clip((h + 5 km - ceiling) / 100 km, 0, 1),
     overshoot; s = clip((floor - h) / 30 km, 0, 1) late in the flight, a dip into the air at orbital speed; b (kg), the
     propellant that a step of the last phase burns, l, what a crash leaves of it. Altitude h (m), time t (s): the step's
-    end's; t_end (s) is the rocket's end_time. Ceiling, floor (110 km), what is late (after 300 s) and mass_unit (the
-    paper's rocket: 100 kg) are the mission's.
+    end's; t_end (s) is the rocket's end_time. Ceiling, floor (110 km, the paper's rocket at the fixed time: 130 km),
+    what is late (after 300 s) and mass_unit (the paper's rocket: 100 kg) are the mission's.
 
     The paper names h > 0, overshoot beyond 250 km and |u_t - u_{t-1}|; the sizes, the margin that lets o begin 5 km
     below the ceiling, the dip and the price of propellant are ours.
