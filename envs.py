@@ -364,7 +364,6 @@ def import_vehicles():
             print(f"vehicles/{path.name} is left out: {why}", file=sys.stderr)
 
 
-# at the fixed time speed has to be wasted, and a climb that is too flat wastes it as well: hence a higher floor
-register_rocket("RocketAscent-v0", **vars(replace(PAPER_MISSION, floor_km=130.0)))
-register_rocket("RocketAscentCutoff-v0", **vars(replace(PAPER_MISSION, cutoff=True)))
+register_rocket("RocketAscent-v0", **vars(PAPER_MISSION))
+register_rocket("RocketAscentCutoff-v0", **vars(replace(PAPER_MISSION, cutoff=True, floor_km=110.0)))
 import_vehicles()

@@ -1,6 +1,6 @@
 """PPO with a Gated Transformer-XL on a four-phase rocket ascent, measured against the true optimum in the same run.
 
-    python ppo_gtrxl_rocket.py --seed 1  # fixed 961 s, as in the paper
+    python ppo_gtrxl_rocket.py --seed 1 --guidance knots  # fixed 961 s, as in the paper
     python ppo_gtrxl_rocket.py --seed 1 --env-id RocketAscentCutoff-v0 --log-std-final -6.2  # free final time
     python ppo_gtrxl_rocket.py --eval-only --checkpoint results/rocket_fixed/agent.safetensors
 
@@ -56,9 +56,8 @@ class Args:
     observe_draw: bool = False  # show the draw to the policy: an oracle
     observe_mass: bool = False  # show the true mass of a dispersed rocket, not the flight computer's
     action_frame: str = "local"  # the thrust direction's axes: local (up, along-track, cross-track) or eci
-    guidance: str = "none"  # early reference pitch of R_guidance: none (R_guidance is 0), linear or knots
+    guidance: str = "none"  # in training: early reference pitch of R_guidance: none (R_guidance is 0), linear or knots
     mass_weight: float = 3.0  # cut-off: the highest price of a mission's mass_unit burnt in the last phase
-    mass_weight_kept: float = 0.1  # part of that price which is kept to the end of the training
     reward_scale: float = 0.2  # factor on the rewards in training; everything logged is unscaled
 
     # transformer (a laptop's; docs/decisions.md has Table 1's beside ours)
@@ -171,11 +170,11 @@ def set_curriculum(envs, args, progress, refines, std):
 
     Noise std scatters the ends of the flights by about std / 10: R_terminal need not be steeper; dispersed ones end
     some 0.001 apart whatever the noise. Burning costs nothing in the first quarter, most at 60 %, when a low perigee
-    may even pay, a part of that at the end: the noise is then too small to find mass, and the orbit counts.
+    may even pay, a tenth of that at the end: the noise is then too small to find mass, and the orbit counts.
     """
     envs.guidance = args.guidance
     envs.terminal_scale = min(TERMINAL_SCALE, max(std / 8, 0.001 if args.dispersion else 0.0))
-    price = np.interp(progress, [0.25, 0.6, 1.0], [0.0, 1.0, args.mass_weight_kept])
+    price = np.interp(progress, [0.25, 0.6, 1.0], [0.0, 1.0, 0.1])
     envs.mass_weight = float(envs.cutoff * args.mass_weight * price)
     envs.flights_per_start = args.flights_per_start
     return envs.flights_per_start

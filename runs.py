@@ -44,7 +44,6 @@ RANGES = {  # lowest and highest value of every numeric flag; NaN and infinity a
     **dict.fromkeys(["embed_dim", "num_heads", "mlp_dim", "hidden_dim"], (1, 8192)),
     **dict.fromkeys(["learning_rate", "learning_rate_final", "clip_coef", "weight_average"], (0.0, 1.0)),
     **dict.fromkeys(["gamma", "gae_lambda", "gae_lambda_final", "memory_noise", "refine_from"], (0.0, 1.0)),
-    "mass_weight_kept": (0.0, 1.0),
     **dict.fromkeys(["ent_coef", "ent_coef_final", "vf_coef", "mass_weight"], (0.0, 1e3)),
     **dict.fromkeys(["reward_scale", "max_grad_norm", "target_kl"], (1e-9, 1e9)),
     **dict.fromkeys(["log_std", "log_std_refine", "log_std_final"], (-8.0, 0.5)),

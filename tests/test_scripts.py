@@ -218,8 +218,7 @@ def test_flags_of_the_interface():
     family_only = {"radius_curriculum", "observe_velocity"}
     assert all(set(words.split()) <= fields[script] | family_only for script in fields)
     assert not {"return_norm", "noise_decay", "target_kl_final"} & fields[DI]
-    rocket_only = {"action_frame", "guidance", "mass_weight", "mass_weight_kept"}
-    rocket_only |= {"dispersion", "observe_draw", "observe_mass"}
+    rocket_only = {"action_frame", "guidance", "mass_weight", "dispersion", "observe_draw", "observe_mass"}
     assert fields[DI] == fields[VDP] == fields[ROCKET] - rocket_only | family_only
 
 
