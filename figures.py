@@ -98,15 +98,18 @@ def draw_training(curves: list[dict], metrics: dict) -> Figure:
     """Reward, policy loss, total loss and the mean action's miss over the samples.
 
     With several seeds each is thin and their median thick. The miss is ||error|| or the cost over the optimum's less 1.
+    A rocket's reward is that of the mean action: the sampled flights pay prices that change during the training.
     """
-    panels = {"charts/episodic_return": "episodic return", "losses/policy_loss": "policy loss"}
-    panels["losses/total_loss"] = "total loss"
+    losses = {"losses/policy_loss": "policy loss", "losses/total_loss": "total loss"}
+    panels = {"charts/episodic_return": "episodic return"} | losses
     if any("eval/error_norm" in curve for curve in curves):
+        panels = {"eval/episodic_return": "episodic return of the mean action"} | losses
         panels["eval/error_norm"] = "$\\Vert$error$\\Vert$ of the mean action"
     elif any("eval/ratio_of_sums" in curve for curve in curves):
         panels["eval/ratio_of_sums"] = "cost / optimum's, less 1, mean action"
     figure = Figure(figsize=(4 * len(panels), 3.8), layout="constrained")
     seeds = f", {len(curves)} seeds" if len(curves) > 1 else ""
+    mean = metrics["reference_episodic_return"]
     figure.suptitle(f"{headline(metrics)}{seeds}")
     for ax, (tag, label) in zip(figure.subplots(1, len(panels)), panels.items()):
         logged = [curve[tag] for curve in curves if tag in curve]
@@ -117,16 +120,17 @@ def draw_training(curves: list[dict], metrics: dict) -> Figure:
                 ax.plot(steps, values, color="tab:red", linewidth=0.7, alpha=0.4, label="" if k else "each seed")
             ax.plot(*median_curve(logged), **POLICY, label=f"median of {len(logged)} seeds")
         elif logged:
-            ax.plot(*logged[0], **{**POLICY, "linewidth": 1.1}, label="policy, sampled actions")
-        if tag == "charts/episodic_return":
-            mean = metrics["reference_episodic_return"]
+            actions = "mean" if tag.startswith("eval/") else "sampled"
+            ax.plot(*logged[0], **{**POLICY, "linewidth": 1.1}, label=f"policy, {actions} actions")
+        if tag.endswith("episodic_return"):
             ax.axhline(mean, **{**OPTIMUM, "linewidth": 1.4}, label=f"optimum, mean {mean:.2f}")
             ax.legend(loc="lower right")
         ax.xaxis.set_major_formatter(EngFormatter(sep=""))
         ax.set(xlabel="environment steps", ylabel=label)
         ax.grid(alpha=0.3)
         if logged:
-            scale_panel(ax, tag, np.concatenate([values for _, values in logged]))
+            seen = [mean] if tag.endswith("episodic_return") else []
+            scale_panel(ax, tag, np.concatenate([seen, *[values for _, values in logged]]))
     return figure
 
 

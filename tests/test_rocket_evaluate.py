@@ -520,7 +520,10 @@ def curve(level=0.0, evaluations=True):
     steps, values = 9600 * update, np.where(update == 1, 1e4, 1 + 0.1 * np.sin(update))
     tags = {"charts/episodic_return": 20 - 60 * 0.9**update + level, "losses/policy_loss": np.sin(update) / 100}
     drawn = {tag: (steps, column) for tag, column in (tags | {"losses/total_loss": values}).items()}
-    return drawn | ({"eval/error_norm": (steps[9::10], 0.5 * 0.5 ** update[:4])} if evaluations else {})
+    if not evaluations:
+        return drawn
+    unpriced = {"eval/episodic_return": (steps[9::10], 30 - 50 * 0.5 ** update[:4] + level)}
+    return drawn | unpriced | {"eval/error_norm": (steps[9::10], 0.5 * 0.5 ** update[:4])}
 
 
 def test_training_figure_shows_the_error_and_no_outlier(flown):
@@ -534,6 +537,8 @@ def test_training_figure_shows_the_error_and_no_outlier(flown):
     assert policy_loss.get_title() == "" and policy_loss.get_ylim()[1] > 0.0099
     blue = [line for line in returns.lines if line.get_color() == "tab:blue"][0]
     assert blue.get_ydata()[0] == metrics["reference_episodic_return"]
+    last_returns = [line.get_ydata()[-1] for line in returns.lines]
+    assert max(last_returns) > 26, "the evaluations' return, not the training's 20, which pays prices"
     assert len(figures.draw_training([curve(evaluations=False)], metrics).axes) == 3
 
 
