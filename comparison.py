@@ -52,7 +52,7 @@ def fly_checkpoint(path, dispersion: float, eval_seed: int, n: int):
 
     BadInput with the script's own line where it refuses.
     """
-    args = evaluate.read_checkpoint(path, {})["args"]
+    args = evaluate.read_checkpoint(path, {}, flag="")["args"]
     with tempfile.TemporaryDirectory() as folder:
         files = [Path(folder) / name for name in ("eval.json", "eval.npz")]
         flags = {"checkpoint": path, "dispersion": dispersion, "eval-starts": n, "eval-seed": eval_seed}
@@ -178,25 +178,24 @@ def recorded_flights(arrays: dict, rocket: envs.Rocket, dispersion: float) -> di
 
 COLUMNS = ("flights", "||error|| median", "p95", "max", "perigee off (km)", "in the box (95 %)", "mass (kg)")
 COLUMNS += ("of the bound", "orbit reached", "a decision", "knows")
-WIDTHS = (7, 16, 8, 8, 16, 24, 9, 12, 13, 10, 0)
+WIDTHS = (7, 16, 8, 8, 16, 24, 9, 14, 14, 10, 0)
 
 
 def table(report: dict) -> str:
     """opponents.json as a table: a line a law, then the first flights of the laws that flew more."""
-    laws = report["laws"]
+    laws, bound = report["laws"], report["bound_flights"]
     fewest = min(law["dispersed_starts"] for law in laws.values())
-    rows = [("", *COLUMNS), *((name, *cells(law, law)) for name, law in laws.items())]
+    rows = [("", *COLUMNS), *((name, *cells(law, law, bound)) for name, law in laws.items())]
     more = {name: law for name, law in laws.items() if law["dispersed_starts"] > fewest}
-    rows += [(f"{name}, the first", *cells(law, law["first"])) for name, law in more.items()]
+    rows += [(f"{name}, the first", *cells(law, law["first"], bound)) for name, law in more.items()]
     width = max(len(row[0]) for row in rows)
     draws = f"the draws of eval seed {report['eval_seed']}, the same for all"
     lines = [f"{report['env_id']} at dispersion {report['dispersion']:g}, {draws}"]
     for name, *others in rows:
         lines.append(f"  {name:<{width}}" + "".join(f"  {cell:>{w}}" for cell, w in zip(others, WIDTHS)))
-    lines.append(
-        f"  Shares: mean of {report['bound_flights']} flights' mass over that of the optimum that knows the draw,"
-    )
-    lines.append("    to the target and to the orbit that was reached.")
+    lines.append("  Shares: mean mass over that of the optimum that knows the draw, to the target and to the orbit")
+    flights = f"of {bound} flights; of fewer (in brackets) where a law missed the orbit."
+    lines.append(f"    that was reached, {flights}")
     if "bound_mass_mean_kg" in report:
         lines[-1] += f" To the target it leaves {report['bound_mass_mean_kg']:.2f} kg on average."
     return "\n".join(
@@ -204,7 +203,15 @@ def table(report: dict) -> str:
     )
 
 
-def cells(law: dict, metrics: dict) -> list[str]:
+def share(law: dict, name: str, bound_flights: int) -> str:
+    """A law's share of the bound's mass, with the number of its flights where they are not all that have a bound."""
+    if f"share_{name}_mean" not in law:
+        return "-"
+    flights = law[f"share_{name}_flights"]
+    return f"{law[f'share_{name}_mean']:.3%}" + (f" ({flights})" if flights != bound_flights else "")
+
+
+def cells(law: dict, metrics: dict, bound_flights: int) -> list[str]:
     """A law's cells of the table: those of its `metrics`, then what does not depend on how many flights they are of."""
     found = [str(metrics["dispersed_starts"])]
     found += [
@@ -214,7 +221,7 @@ def cells(law: dict, metrics: dict) -> list[str]:
     found.append("-" if None in perigee else f"{perigee[0]:+.2f} ± {perigee[1]:.2f}")
     rate, low, high = (metrics[f"dispersed_box_{part}"] for part in ("rate", "low", "high"))
     found += [f"{rate:.1%} ({low:.1%} to {high:.1%})", f"{metrics['dispersed_mass_mean_kg']:.2f}"]
-    found += [f"{law[key]:.3%}" if key in law else "-" for key in ("share_target_mean", "share_reached_mean")]
+    found += [share(law, name, bound_flights) for name in ("target", "reached")]
     return [*found, duration(law.get("decision_us")), law["knows"]]
 
 
@@ -240,7 +247,7 @@ def check(folder: Path, n: int, solved: int, checkpoints: dict) -> str:
         solved <= most, "--solved", solved, f"must be at most {most}: --starts is {n}, a batch {evaluate.AT_ONCE}"
     )
     for path in checkpoints.values():
-        other = evaluate.read_checkpoint(path, {})["args"]["env_id"]
+        other = evaluate.read_checkpoint(path, {}, flag="")["args"]["env_id"]
         refuse_unless(other == env_id, f"the env_id of {path}", other, f"must be {env_id}, as that of {folder}")
     refuse_unless(os.access(folder, os.W_OK), "the folder", folder, "must be writable")
     return env_id

@@ -19,8 +19,8 @@ import hashlib
 import json
 import math
 import sys
+import tempfile
 import time
-import zipfile
 from functools import lru_cache
 from pathlib import Path
 
@@ -31,6 +31,7 @@ import baselines
 import envs
 from baselines import OneLineParser, integer, replacing, starts
 from envs import BadInput
+from rocket_baselines import DAMAGED_NPZ
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Cases and ratios
@@ -227,11 +228,13 @@ def write_bytes(path, data: bytes | memoryview):
 
 
 def write_json(path, metrics: dict):
-    """Write metrics as flat JSON in the given order; ValueError names a key that is not finite."""
+    """Write metrics as JSON in the given order; ValueError names the key that holds a number which is not finite."""
     plain = {key: value.item() if isinstance(value, np.generic) else value for key, value in metrics.items()}
     for key, value in plain.items():
-        if isinstance(value, float) and not math.isfinite(value):
-            raise ValueError(f"{key} is {value}; eval.json holds finite numbers only")
+        try:
+            json.dumps(value, allow_nan=False)
+        except ValueError as error:
+            raise ValueError(f"{key} is {value}; {Path(path).name} holds finite numbers only") from error
     write_bytes(path, (json.dumps(plain, indent=2) + "\n").encode())
 
 
@@ -244,18 +247,20 @@ def write_npz(path, arrays: dict):
 def write(metrics: dict, arrays: dict, checkpoint, json_path, npz_path):
     """Write an evaluation of the file `checkpoint`, which `metrics` then names by its sha256; None writes nothing."""
     metrics["checkpoint_sha256"] = hashlib.sha256(Path(checkpoint).read_bytes()).hexdigest()
-    if json_path is not None:
-        write_json(json_path, metrics)
     if npz_path is not None:
         write_npz(npz_path, arrays)
+    if json_path is not None:  # last: a run with its eval.json is finished
+        write_json(json_path, metrics)
 
 
-def read_checkpoint(path, expected: dict[str, type], env_ids=(), defaults: dict | None = None) -> dict:
+def read_checkpoint(
+    path, expected: dict[str, type], env_ids=(), defaults: dict | None = None, flag: str = "--checkpoint "
+) -> dict:
     """An agent.safetensors: `args` (the run's arguments), `progress` (its counters), `tensors` (NumPy arrays).
 
     `expected` gives the type of each argument that must be there, `env_ids` the environments that it may be of (none:
-    any), `defaults` what an older file need not hold. Raises BadInput if the file is missing, damaged or of something
-    else, or holds a weight that is not finite.
+    any), `defaults` what an older file need not hold. Raises BadInput, which begins with `flag` and the path, if the
+    file is missing, damaged or of something else, or holds a weight that is not finite.
     """
     try:
         data = Path(path).read_bytes()
@@ -264,7 +269,7 @@ def read_checkpoint(path, expected: dict[str, type], env_ids=(), defaults: dict 
         args = {**(defaults or {}), **json.loads(metadata["args"])}
         env_id = args["env_id"]
         if env_ids and isinstance(env_id, str) and env_id not in env_ids:  # another script's has other arguments, too
-            raise BadInput(f"--checkpoint {path}: is of {env_id}; this script takes {', '.join(env_ids)}")
+            raise BadInput(f"{flag}{path}: is of {env_id}; this script takes {', '.join(env_ids)}")
         wrong = [name for name, kind in expected.items() if type(args[name]) is not kind]
         metadata.setdefault("training_seconds", metadata["wall_seconds"])  # an older file counted no other time
         counters = {"seed": int, "total_updates": int, "global_step": int}
@@ -275,29 +280,34 @@ def read_checkpoint(path, expected: dict[str, type], env_ids=(), defaults: dict 
     except BadInput:
         raise
     except OSError as error:
-        raise BadInput(f"--checkpoint {path}: {error.strerror}; it must be an agent.safetensors") from error
+        raise BadInput(f"{flag}{path}: {error.strerror}; it must be an agent.safetensors") from error
     except (safetensors.SafetensorError, KeyError, TypeError, ValueError) as error:
-        raise BadInput(f"--checkpoint {path}: damaged or foreign ({error}); it must be an agent.safetensors") from error
+        raise BadInput(f"{flag}{path}: damaged or foreign ({error}); it must be an agent.safetensors") from error
     if wrong:
         name = wrong[0]
-        raise BadInput(f"--checkpoint {path}: its {name} is {args[name]!r}; must be {expected[name].__name__}")
+        raise BadInput(f"{flag}{path}: its {name} is {args[name]!r}; must be {expected[name].__name__}")
     if not all(np.isfinite(tensor).all() for tensor in tensors.values()):
-        raise BadInput(f"--checkpoint {path}: holds a NaN or an infinity; its weights must be finite")
+        raise BadInput(f"{flag}{path}: holds a NaN or an infinity; its weights must be finite")
     return {"args": args, "progress": progress, "tensors": tensors}
 
 
 def read_evaluation(folder: Path) -> tuple[dict, dict]:
     """The `metrics` and `arrays` of a run's or results folder; OSError or ValueError names the file that is bad."""
     metrics = read_json(folder / "eval.json")
+    try:
+        table(metrics)
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{folder / 'eval.json'} lacks a number of its table, or has a wrong one: {error}") from error
     path = folder / "eval.npz"
     try:
         with np.load(path) as file:
             arrays = {key: file[key] for key in file.files}
-    except (ValueError, EOFError, zipfile.BadZipFile) as error:
+    except DAMAGED_NPZ as error:
         raise ValueError(f"{path} is not a readable .npz: {error}") from error
     needed = {"t", "x", "u", "reward", "cost", "x_reference", "u_reference", "cost_reference"}
     if metrics["env_id"] in envs.ROCKETS:
         needed = {f"{key}{side}" for key in ("t", "u", "y") for side in ("", "_reference")} | {"reward"}
+        needed |= {"draw", "final_y", "final_error"} if "dispersion" in metrics else set()
     if missing := needed - arrays.keys():
         raise ValueError(f"{path} lacks {', '.join(sorted(missing))}")
     return metrics, arrays
@@ -684,7 +694,7 @@ def publish(run_dir, folder, ship: bool = False, numbers: bool = False):
 
     The policy, its evaluation and the figures are replaced only where the folder ships none or with `ship`; with
     `numbers` the folder holds seeds/ alone. OSError or ValueError says what is missing or does not fit; nothing has
-    been written then.
+    been written then. All is drawn before, and seeds/<seed>.json is written last: where it is, the rest is, too.
     """
     run_dir, folder = Path(run_dir), Path(folder)
     metrics, _ = read_evaluation(run_dir)
@@ -699,14 +709,25 @@ def publish(run_dir, folder, ship: bool = False, numbers: bool = False):
         raise ValueError(f"{run_dir} is of {metrics['env_id']}, {folder} of {shipped['env_id']}")
     if shipped and not ship and shipped["seed"] == metrics["seed"]:
         raise ValueError(f"{folder} already ships seed {metrics['seed']}; --ship replaces it")
-    (folder / "seeds").mkdir(parents=True, exist_ok=True)
-    write_csv(folder / "seeds" / f"{metrics['seed']}.csv", curve)
-    write_bytes(folder / "seeds" / f"{metrics['seed']}.json", (run_dir / "eval.json").read_bytes())
-    if (ship or not shipped) and not numbers:
-        for name in ("agent.safetensors", "eval.npz", "eval.json"):
-            write_bytes(folder / name, (run_dir / name).read_bytes())
-        redraw(folder)
-        animate(folder)
+    seed, ships = metrics["seed"], (ship or not shipped) and not numbers
+    with tempfile.TemporaryDirectory() as name:
+        staged = Path(name)
+        (staged / "seeds").mkdir()
+        for path in (folder / "seeds").glob("*.csv"):
+            write_bytes(staged / "seeds" / path.name, path.read_bytes())
+        write_csv(staged / "seeds" / f"{seed}.csv", curve)
+        last = staged / "seeds" / f"{seed}.json"
+        write_bytes(last, (run_dir / "eval.json").read_bytes())
+        if ships:
+            for file in ("agent.safetensors", "eval.npz", "eval.json"):
+                write_bytes(staged / file, (run_dir / file).read_bytes())
+            redraw(staged)
+            animate(staged)
+        files = [path for path in staged.rglob("*") if path.is_file()]
+        for path in sorted(files, key=lambda path: (path == last, path)):
+            target = folder / path.relative_to(staged)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            write_bytes(target, path.read_bytes())
 
 
 def redraw(folder) -> list[Path]:

@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import json
 import time
+import tokenize
 import warnings
+import zlib
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -20,6 +22,8 @@ import numpy as np
 
 import envs
 from envs import ROCKET, ROCKETS, Mission, Rocket, rk4
+
+DAMAGED_NPZ = (ValueError, EOFError, BadZipFile, zlib.error, tokenize.TokenError)  # what np.load raises on one
 
 
 class NoOptimum(RuntimeError):
@@ -397,7 +401,7 @@ def rocket_reference(env_id: str, **options) -> dict:
         numbers, u, end = stored_ascent(key)
         flight = fly_directions(env_id, rocket, u, end)
         stale = not flight["error_norm"] <= max(MISS_TOLERANCE, 1.01 * numbers["replay_error_norm"])
-    except (OSError, EOFError, LookupError, TypeError, ValueError, BadZipFile):
+    except (OSError, LookupError, TypeError, *DAMAGED_NPZ):
         stale = True
     if stale or mission != ROCKETS[env_id]:
         numbers, flight, _ = solve_ascent(case)

@@ -243,11 +243,15 @@ def prepare_torch(args):
 
 
 def make_envs(args, env_options):
-    """This process's share of the environments, seeded; env_options go to each."""
+    """This process's share of the environments, seeded; env_options go to each.
+
+    An evaluation draws its starts as a reset does: its seed would train on them, so another takes its place.
+    """
     rank, processes = process()
     share = args.num_envs // processes + (rank < args.num_envs % processes)
     envs = gym.make_vec(args.env_id, num_envs=share, **env_options)
-    envs.reset(seed=args.seed + 2**31 * rank)
+    seed = args.seed + 2**31 * rank
+    envs.reset(seed=seed + 2**40 if seed in (args.eval_seed, TRAINING_EVAL_SEED) else seed)
     return envs
 
 

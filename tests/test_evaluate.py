@@ -1,6 +1,7 @@
 """evaluate.py against plain loops: ratios, the interface's keys, figures, results folders, bad input."""
 
 import csv
+import errno
 import hashlib
 import json
 import subprocess
@@ -382,6 +383,8 @@ def test_json_refuses_what_is_not_finite_and_keeps_the_old_file(bad, tmp_path):
     before = snapshot(tmp_path)
     with pytest.raises(ValueError, match="ratio_mean is"):
         evaluate.write_json(path, {"seed": 2, "ratio_mean": bad})
+    with pytest.raises(ValueError, match="laws is .*; eval.json holds finite"):
+        evaluate.write_json(path, {"seed": 2, "laws": {"replay": {"share": float(bad)}}})
     assert snapshot(tmp_path) == before
 
 
@@ -536,13 +539,37 @@ def test_publish_ships_the_first_seed_and_adds_the_second(tmp_path, monkeypatch,
     assert snapshot(results)[Path("figures/training.png")] != files[Path("figures/training.png")]
     assert (results / "agent.safetensors").read_bytes() == b"weights of seed 1"
 
-    redrawn = []
-    for name in ("redraw", "animate"):  # neither a figure nor an animation of the policy before it stays
-        monkeypatch.setattr(evaluate, name, redrawn.append)
+    before = snapshot(results)
+    monkeypatch.setattr(evaluate, "animate", full_disk)
+    with pytest.raises(SystemExit, match="No space left"):
+        command_line(monkeypatch, capsys, "publish", second, results, "--ship")
+    assert snapshot(results) == before
+
+    def draw(name):  # a stand-in for redraw and animate that shows of which policy it is
+        def drawn(folder):
+            (folder / "figures").mkdir(exist_ok=True)
+            (folder / "figures" / name).write_bytes((folder / "agent.safetensors").read_bytes())
+
+        return drawn
+
+    for function, name in (("redraw", "training.png"), ("animate", "animation.gif")):
+        monkeypatch.setattr(evaluate, function, draw(name))
     command_line(monkeypatch, capsys, "publish", second, results, "--ship")
-    assert redrawn == [results, results]
-    assert (results / "agent.safetensors").read_bytes() == b"weights of seed 2"
+    for name in ("agent.safetensors", "figures/training.png", "figures/animation.gif"):
+        assert (results / name).read_bytes() == b"weights of seed 2"
     assert json.loads((results / "eval.json").read_text())["seed"] == 2
+
+
+def test_a_seed_is_listed_once_the_rest_is_there(tmp_path, monkeypatch, capsys):
+    """`run_seeds.py` takes seeds/<seed>.json as the sign that a run is published."""
+    run, results, written = make_run(tmp_path / "run", seed=1), tmp_path / "results", []
+    for name in ("redraw", "animate"):
+        monkeypatch.setattr(evaluate, name, lambda folder: [])
+    write = evaluate.write_bytes
+    monkeypatch.setattr(evaluate, "write_bytes", lambda path, data: [written.append(Path(path)), write(path, data)])
+    command_line(monkeypatch, capsys, "publish", run, results)
+    assert written[-1] == results / "seeds" / "1.json"
+    assert {path.name for path in written if results in path.parents} == {"1.csv", "1.json", *SHIPPED}
 
 
 def test_figures_of_a_run_folder(tmp_path, monkeypatch, capsys):
@@ -552,6 +579,13 @@ def test_figures_of_a_run_folder(tmp_path, monkeypatch, capsys):
     assert {path.name for path in (run / "figures").iterdir()} == {"training.png", "trajectories.png", "costs.png"}
 
 
+SHIPPED = ("agent.safetensors", "eval.npz", "eval.json")
+
+
+def full_disk(*_):
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
 def spoil(run, fault):
     """Damage a run folder in one way."""
     if fault == "no events":
@@ -559,6 +593,14 @@ def spoil(run, fault):
             path.unlink()
     elif fault in ("agent.safetensors", "eval.json", "eval.npz"):
         (run / fault).unlink()
+    elif fault == "a bit of the npz":
+        data = bytearray((run / "eval.npz").read_bytes())
+        data[len(data) // 2] ^= 1
+        (run / "eval.npz").write_bytes(data)
+    elif fault == "no table":
+        metrics = json.loads((run / "eval.json").read_text())
+        del metrics["reference_cost_mean"]
+        (run / "eval.json").write_text(json.dumps(metrics))
     elif fault == "truncated npz":
         (run / "eval.npz").write_bytes((run / "eval.npz").read_bytes()[:200])
     elif fault == "broken json":
@@ -578,6 +620,8 @@ FAULTS = {
     "eval.npz": "eval.npz",
     "no events": "no TensorBoard scalars",
     "truncated npz": "not a readable .npz",
+    "a bit of the npz": "not a readable .npz",
+    "no table": "lacks a number of its table",
     "broken json": "not readable JSON",
     "other weights": "checkpoint_sha256",
     "other env": "VanDerPol-v0",

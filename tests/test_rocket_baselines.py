@@ -8,6 +8,7 @@ import sys
 from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
+from zipfile import ZipFile
 
 import numpy as np
 import pytest
@@ -198,6 +199,16 @@ def cut_npz(folder):
     path.write_bytes(path.read_bytes()[:2000])
 
 
+def flip_bits(folder):
+    """One bit in the middle of the stored times: the archive's directory stays whole, their data does not."""
+    path = folder / "rocket_reference.npz"
+    data = bytearray(path.read_bytes())
+    with ZipFile(path) as archive:
+        entry = archive.getinfo("free_t.npy")
+    data[entry.header_offset + 30 + len(entry.filename) + entry.compress_size // 2] ^= 1
+    path.write_bytes(data)
+
+
 def forget_key(folder):
     (folder / "rocket_reference.json").write_text('{"fixed_capped": {}}')
 
@@ -221,7 +232,7 @@ def shorten(folder):
     np.savez_compressed(folder / "rocket_reference.npz", **arrays)
 
 
-@pytest.mark.parametrize("damage", [drop_json, cut_npz, forget_key, break_json, turn, shorten])
+@pytest.mark.parametrize("damage", [drop_json, cut_npz, flip_bits, forget_key, break_json, turn, shorten])
 def test_reference_is_solved_anew_where_the_files_do_not_serve(command, flights, shipped, monkeypatch, damage):
     damage(shipped)
     before, solved = {path.name: path.read_bytes() for path in shipped.iterdir()}, []

@@ -26,6 +26,7 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import animation
+import baselines
 import envs
 import runs
 
@@ -459,6 +460,15 @@ def test_eval_every_uses_starts_of_its_own(tmp_path, monkeypatch):
     assert len(seeds) == 2 and seeds[1] == 5
     assert seeds[0] > runs.RANGES["eval_seed"][1]  # no --eval-seed reaches it
     assert [step for step, _ in scalars(run_folder())["eval/ratio_of_sums"]] == [200, 300]
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+def test_no_evaluated_start_is_trained_on(seed):
+    """Also where the seeds are the same: both draw uniformly from a generator of that seed."""
+    args = DI.Args(seed=seed, eval_seed=seed, num_envs=40)
+    first_starts = runs.make_envs(args, {}).reset()[0][:, :2]
+    evaluated = baselines.starts(seed, 1000)
+    assert not np.isin(first_starts, evaluated).any()
 
 
 @pytest.mark.parametrize("decay", [0.9, 0.0])
