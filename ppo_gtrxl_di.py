@@ -117,13 +117,13 @@ def set_curriculum(envs, args, progress, refines, std):
     """What only training changes, all of it ours; returns how many flights in a row have the same start.
 
     Many starts at first, in the refinement each one several times. The waypoints' radius is --radius-curriculum times
-    the true one at first and shrinks geometrically to it until 60 % of the updates, also in a refinement that begins
+    the true one at first and shrinks geometrically to it until half of the updates, also in a refinement that begins
     earlier: the circle, 0.02, is so small that flights of much noise miss it. Refined flights aim at one a tenth
     smaller, because the optimum lies on its edge.
     """
     envs.flights_per_start = args.flights_per_start if refines else 1
     if len(envs.problem.phases) > 1:
-        radius_scale = args.radius_curriculum ** max(0.0, 1 - progress / 0.6)
+        radius_scale = args.radius_curriculum ** max(0.0, 1 - 2 * progress)
         envs.radius_scale = 0.9 * radius_scale if refines else radius_scale
     return envs.flights_per_start
 
