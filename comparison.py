@@ -86,10 +86,13 @@ class Comparison:
         self.arrays, self.about, self.optima = {}, {}, []
 
     def fly_policies(self, checkpoints: dict):
-        """Fly the policies of these files, name -> agent.safetensors."""
+        """Fly the policies of these files, name -> agent.safetensors; ValueError where one flew other draws."""
+        z = evaluate.draws(self.rocket, self.dispersion, self.eval_seed, self.n)
         fly = lambda path: fly_checkpoint(path, self.dispersion, self.eval_seed, self.n)  # noqa: E731
         with ThreadPoolExecutor(PROCESSES) as pool:  # each thread waits for a process
             for name, flown in zip(checkpoints, pool.map(fly, checkpoints.values())):
+                if not np.array_equal(flown[0]["draw"], z):
+                    raise ValueError(f"{name} did not fly the draws of eval seed {self.eval_seed}")
                 self.arrays[name], self.about[name] = flown
 
     def fly_opponents(self):
