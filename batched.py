@@ -45,7 +45,9 @@ class BatchedEnv(VectorEnv):
 
     With the attribute `flights_per_start` G, to be set before a `reset` and only in training, environment k flies start
     k // G, so that flights differ by their actions alone (1: each flies its own start; the last group is smaller where
-    G does not divide N). A dispersed rocket's start is its vehicle and air.
+    G does not divide N). A dispersed rocket's start is its vehicle and air. This is promised of the episodes that begin
+    at a `reset`, and our scripts train on no others: an autoreset groups the environments that ended in its step,
+    whatever their k.
     """
 
     metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
@@ -131,7 +133,10 @@ class BatchedEnv(VectorEnv):
         return tuple(self._sheet.frame(animation.Flight(t, u[1:], y)) for t, u, y in columns)
 
     def _draw_starts(self, draw, count):
-        """Starts (count, k) of which each is `flights_per_start` environments'; `draw(n)` draws n of them, (n, k)."""
+        """Starts (count, k) of episodes that begin together, each `flights_per_start` in a row; `draw(n)` draws n.
+
+        At a `reset`, where all begin, row k is environment k's.
+        """
         group = self.flights_per_start
         if not (isinstance(group, int | np.integer) and group >= 1):
             raise ValueError(f"flights_per_start is {group!r}; it must be a whole number of at least 1")

@@ -79,8 +79,8 @@ class RocketVectorEnv(BatchedEnv):
 
     Attributes that only training changes, to be set before a `reset`: `mass_weight`, `trajectory_weight`,
     `guidance_weight`, `guidance` (a key of `REFERENCE_PITCH`), `end_time` (s, at most the last phase's end),
-    `flights_per_start` (`BatchedEnv`; of each draw) and `terminal_scale`, a curriculum: the *reward* pays R_terminal
-    with it, `final_info` reports it with `TERMINAL_SCALE`.
+    `flights_per_start` (`BatchedEnv`; of each draw of a `reset`) and `terminal_scale`, a curriculum: the *reward* pays
+    R_terminal with it, `final_info` reports it with `TERMINAL_SCALE`.
     """
 
     metadata = {**BatchedEnv.metadata, **DRAWN}
@@ -188,7 +188,10 @@ class RocketVectorEnv(BatchedEnv):
         self._distance[mask], self._energy[mask] = distance[mask], energy[mask]
 
     def _launch(self, mask, given):
-        """Vehicles for the environments in `mask`: of the given draws (N, k), else of their own."""
+        """Vehicles for the environments in `mask`: of the given draws (N, k), else of new ones.
+
+        New ones are `flights_per_start` environments' each, in the order of those in `mask`.
+        """
         if given is None:
             scores = lambda n: self.np_random.standard_normal((n, self.draw.shape[1]))  # noqa: E731
             draw = np.clip(self._draw_starts(scores, int(mask.sum())), -self._draw_bounds, self._draw_bounds)

@@ -429,6 +429,24 @@ def test_flights_of_a_group_share_their_draw(num_envs, group, groups):
     np.testing.assert_array_equal(batch.draw, given)
 
 
+def test_a_reset_groups_what_an_autoreset_has_scattered():
+    """After a crash of one flight its environment has a draw of its own; from the next reset on k has draw k // G."""
+    batch, action = make(CUTOFF, 4), np.tile([1.0, 0.1, 0.0], (4, 1))
+    batch.flights_per_start = 2
+    batch.reset(seed=1)
+    first = batch.draw.copy()
+    action[1] = -1.0, 0.0, 0.0  # into the ground
+    ended = np.zeros(4, dtype=bool)
+    while not ended.any():
+        _, _, ended, _, _ = batch.step(action)
+    assert ended.tolist() == [False, True, False, False]
+    np.testing.assert_array_equal(batch.draw[[0, 2, 3]], first[[0, 2, 3]])
+    assert len(np.unique(batch.draw[:, 0])) == 3
+    batch.reset()
+    np.testing.assert_array_equal(batch.draw[::2], batch.draw[1::2])
+    assert len(np.unique(np.append(batch.draw[:, 0], first[:, 0]))) == 4
+
+
 def test_autoreset_draws_anew_only_for_those_that_ended():
     batch = make(CUTOFF, 3)
     batch.reset(seed=1)

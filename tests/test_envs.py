@@ -433,7 +433,7 @@ def test_starts_follow_the_seed(env_id):
 @pytest.mark.parametrize("env_id", PROBLEMS)
 @pytest.mark.parametrize("num_envs, group, groups", [(6, 1, 6), (6, 2, 3), (6, 6, 1), (7, 3, 3), (2, 5, 1)])
 def test_flights_per_start(env_id, num_envs, group, groups):
-    """Environment k flies start k // G: the draws of a smaller batch, each G times, at a reset and at the autoreset."""
+    """Environment k flies start k // G: the draws of a smaller batch, each G times, at a reset and where all end."""
     envs, few = gym.make_vec(env_id, num_envs=num_envs), gym.make_vec(env_id, num_envs=groups)
     envs.unwrapped.flights_per_start = group
     rows = np.arange(num_envs) // group
