@@ -49,7 +49,7 @@ PEERS = {
     "cutoff_raw": Peer("cut-off, raw, our samples", f"{CUTOFF} --samples 7450000 --features raw", ROCKET_KEYS),
     "lstm_dispersed": Peer(
         "LSTM, from there, dispersed",
-        f"{LSTM} --dispersion 1 --start runs/peer_lstm_1.zip",
+        f"{LSTM} --dispersion 1 --mass-weight 0.5 --log-std -3.5 --start runs/peer_lstm_1.zip",
         DISPERSED_KEYS,
         (1,),
     ),
