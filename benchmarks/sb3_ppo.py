@@ -16,6 +16,8 @@ from __future__ import annotations
 
 import importlib
 import json
+import shlex
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -217,6 +219,15 @@ def make_model(options, script, args, normalised, steps):
     return model
 
 
+def commit():
+    """The short hash of the code's commit; None where there is no git."""
+    command = ["git", "-C", str(ROOT), "rev-parse", "--short", "HEAD"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
+
 def flag(name):
     return f"--{name.replace('_', '-')}"
 
@@ -260,6 +271,7 @@ def parse_args():
 
 def main():
     options = parse_args()
+    code = {"commit": commit(), "flags": shlex.join(sys.argv[1:])}  # now: hours later it may be another
     torch.set_num_threads(1)
     script = next(s for s in map(importlib.import_module, SCRIPTS) if options.env_id in s.ENV_IDS)
     args = script.Args(env_id=options.env_id)
@@ -287,7 +299,7 @@ def main():
         model.save(options.save)
         normalised.save(options.save.with_suffix(".pkl"))
     if options.json:
-        options.json.write_text(json.dumps({"curve": evaluation.curve, "final": evaluation.metrics}, indent=1) + "\n")
+        evaluate.write_json(options.json, {**code, "curve": evaluation.curve, "final": evaluation.metrics})
 
 
 if __name__ == "__main__":

@@ -1,6 +1,10 @@
 """Stable-Baselines3 on these environments, in its own ways and by the native batch; skipped where it is missing."""
 
+import json
 import pickle
+import shlex
+import subprocess
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -17,6 +21,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormali
 
 from sb3_env import NativeVecEnv
 
+ROOT = Path(__file__).parent.parent
 IDS = ["VanDerPolWaypoints-v0", "RocketAscentCutoff-v0"]
 OPTIONS = {env_id: {"action_frame": "local"} if env_id in envs.ROCKETS else {} for env_id in IDS}
 
@@ -226,14 +231,25 @@ def test_the_benchmarks_dispersed_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     flags = "--env-id RocketAscentCutoff-v0 --num-envs 1 --batch-size 1000 --epochs 1 --samples 900".split()
 
+    def cut(*paths):
+        raise InterruptedError
+
     def run(*more):
         monkeypatch.setattr("sys.argv", ["sb3_ppo.py", *flags, *more])
         sb3_ppo.main()
 
-    run("--save", "nominal.zip")
+    run("--save", "nominal.zip", "--json", "nominal.json")
+    written = json.loads((tmp_path / "nominal.json").read_text())
+    assert written["flags"] == shlex.join([*flags, "--save", "nominal.zip", "--json", "nominal.json"])
+    assert written["final"]["mass_ratio"] == 0.9 and written["curve"][-1]["samples"] >= 900
+    head = subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True).stdout
+    assert head.startswith(written["commit"] or "-") or not head  # the project may stand outside git
     start = ["--start", "nominal.zip", "--dispersion", "1"]
     run(*start, "--save", "dispersed.zip", "--mass-weight", "0.5", "--log-std", "-3.5")
-    run(*start)
+    with monkeypatch.context() as broken, pytest.raises(InterruptedError):
+        broken.setattr("os.replace", cut)
+        run(*start, "--json", "nominal.json")
+    assert json.loads((tmp_path / "nominal.json").read_text()) == written  # whole or untouched
     assert made[0] == (3.0, 0.0, [pytest.approx(-1.4)] * 3) and made[1] == (0.5, 1.0, [-3.5] * 3)
     assert made[2][:2] == (3.0, 1.0) and made[2][2] != made[0][2] and max(made[2][2]) < -1.3  # learnt
     assert evaluated == [(1000, 0.0)] * 2 + [(1705, 1.0)] * 4  # twice in each run
