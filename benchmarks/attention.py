@@ -24,6 +24,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 import envs  # noqa: E402
 import evaluate  # noqa: E402
+import figures  # noqa: E402
 import runs  # noqa: E402
 
 UNTRAINED = 1 / (1 + np.exp(-2.0))  # lambda under b_g alone
@@ -165,9 +166,8 @@ def main():
         events = changes(args.env_id, obs, t)
         print("\n".join(lines(found, t, events)))
         print("\n".join(gate_lines(gates(agent, obs))))
-        draw(found, t, events, f"{args.env_id}: attention along one flight (lines: a new phase)").savefig(
-            options.figure
-        )
+        drawn = draw(found, t, events, f"{args.env_id}: attention along one flight (lines: a new phase)")
+        figures.save(options.figure.parent, {options.figure.name: drawn})
     except (OSError, ValueError) as error:
         sys.exit(f"error: {error}")
 

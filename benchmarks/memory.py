@@ -27,6 +27,7 @@ sys.path.insert(0, str(ROOT))
 import baselines  # noqa: E402
 import envs  # noqa: E402
 import evaluate  # noqa: E402
+import figures  # noqa: E402
 
 
 @dataclass
@@ -171,7 +172,7 @@ def main():
             raise ValueError(f"{folder} has no finished run; benchmarks/memory_*_jobs.txt list them")
         for name, found in results.items():
             print("\n".join(table(EXPERIMENTS[name], found)))
-        draw(results).savefig(folder / "memory.png", dpi=100)
+        figures.save(folder, {"memory.png": draw(results)})
     except (OSError, ValueError) as error:
         sys.exit(f"error: {error}")
 

@@ -82,6 +82,15 @@ def test_attention_of_a_shipped_policy(name, heads, tmp_path, monkeypatch, capsy
     )
 
 
+def test_a_figure_of_attention_is_whole_or_as_it_was(tmp_path, monkeypatch, capsys, cut_figures):
+    path = tmp_path / "attention.png"
+    path.write_bytes(b"the old one")
+    monkeypatch.setattr(sys, "argv", ["attention.py", str(ROOT / "results" / "vdp_waypoints"), str(path)])
+    with pytest.raises(SystemExit, match="error: .*No space left"):
+        attention.main()
+    assert path.read_bytes() == b"the old one" and len(list(tmp_path.iterdir())) == 1
+
+
 def evaluations(folder, values):
     for seed, value in enumerate(values, start=1):
         (folder / "seeds").mkdir(parents=True, exist_ok=True)
@@ -101,6 +110,15 @@ def test_table_and_figure_of_what_is_there(tmp_path, monkeypatch, capsys):
     assert "velocity shown" in rows[1] and "1.005" in rows[1] and "-" in rows[1]
     assert "no memory can beat" in rows[2] and len(rows) == 3
     assert imread(folder / "memory.png").std() > 0.05
+
+
+def test_the_figure_is_whole_or_as_it_was(tmp_path, monkeypatch, capsys, cut_figures):
+    evaluations(tmp_path / "hidden_velocity" / "memory_4", [1.5])
+    (tmp_path / "memory.png").write_bytes(b"the old one")
+    monkeypatch.setattr(sys, "argv", ["memory.py", str(tmp_path)])
+    with pytest.raises(SystemExit, match="error: .*No space left"):
+        memory.main()
+    assert (tmp_path / "memory.png").read_bytes() == b"the old one" and not list(tmp_path.glob(".*"))
 
 
 def test_what_no_memory_can_beat_is_the_best_of_first_actions_that_see_the_position_alone():
