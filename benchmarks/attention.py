@@ -51,7 +51,7 @@ def observations(agent, args, options, eval_seed):
     if rocket:
         start = {"draw": evaluate.draws(environment.rocket, args.dispersion, eval_seed, 1)} if args.dispersion else {}
     else:
-        start = {"x0": evaluate.starts(eval_seed, 1)}
+        start = {"x0": evaluate.starts(eval_seed, 1, environment.problem.x0_max)}
     obs, _ = environment.reset(options=start)
     policy, seen, ended = agent.make_policy(environment.episode_steps), [], np.array([False])
     while not ended.all():

@@ -1,10 +1,12 @@
 """`benchmarks/attention.py` and `benchmarks/memory.py`: the weights against the network's own output, the tables."""
 
+import dataclasses
 import json
 import os
 import shlex
 import sys
 from pathlib import Path
+from unittest import mock
 
 import attention
 import memory
@@ -80,6 +82,17 @@ def test_attention_of_a_shipped_policy(name, heads, tmp_path, monkeypatch, capsy
         and "past the MLP" in printed
         and imread(path).std() > 0.05
     )
+
+
+def test_the_flight_begins_with_the_evaluations_first_start(new_problem):
+    """Of a problem whose starts are of another box than the paper's."""
+    env_id = new_problem(dataclasses.replace(envs.DOUBLE_INTEGRATOR, env_id="WideBox-v0", x0_max=2.5))
+    args, resting = script.Args(env_id=env_id), mock.Mock()
+    resting.make_policy.return_value = lambda obs, t: np.zeros((1, 1))
+    obs, t = attention.observations(resting, args, {}, eval_seed=3)
+    _, flight = evaluate.evaluate(env_id, lambda obs, t: np.zeros((len(obs), 1)), 3, 10)
+    np.testing.assert_allclose(obs[:, :2], flight["x"][0, :-1])
+    assert len(t) == len(obs) == 50 and np.abs(obs[0, :2]).max() < 2.5
 
 
 def test_a_figure_of_attention_is_whole_or_as_it_was(tmp_path, monkeypatch, capsys, cut_figures):
