@@ -24,6 +24,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 import envs  # noqa: E402
 import evaluate  # noqa: E402
+import figures  # noqa: E402
 import runs  # noqa: E402
 
 UNTRAINED = 1 / (1 + np.exp(-2.0))  # lambda under b_g alone
@@ -50,7 +51,7 @@ def observations(agent, args, options, eval_seed):
     if rocket:
         start = {"draw": evaluate.draws(environment.rocket, args.dispersion, eval_seed, 1)} if args.dispersion else {}
     else:
-        start = {"x0": evaluate.starts(eval_seed, 1)}
+        start = {"x0": evaluate.starts(eval_seed, 1, environment.problem.x0_max)}
     obs, _ = environment.reset(options=start)
     policy, seen, ended = agent.make_policy(environment.episode_steps), [], np.array([False])
     while not ended.all():
@@ -165,9 +166,8 @@ def main():
         events = changes(args.env_id, obs, t)
         print("\n".join(lines(found, t, events)))
         print("\n".join(gate_lines(gates(agent, obs))))
-        draw(found, t, events, f"{args.env_id}: attention along one flight (lines: a new phase)").savefig(
-            options.figure
-        )
+        drawn = draw(found, t, events, f"{args.env_id}: attention along one flight (lines: a new phase)")
+        figures.save(options.figure.parent, {options.figure.name: drawn})
     except (OSError, ValueError) as error:
         sys.exit(f"error: {error}")
 

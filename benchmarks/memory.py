@@ -6,7 +6,7 @@
     python benchmarks/memory.py                                                             # prints, draws: seconds
 
 Each row is one way of learning, each figure the median over its seeds with the range of all. Rows without a finished
-run are left out. Beside the hidden velocity stands what no memory can beat.
+run are left out. Beside the hidden velocity stands the expected cost that no memory can beat.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ sys.path.insert(0, str(ROOT))
 import baselines  # noqa: E402
 import envs  # noqa: E402
 import evaluate  # noqa: E402
+import figures  # noqa: E402
 
 
 @dataclass
@@ -37,7 +38,7 @@ class Experiment:
     rows: dict[str, str]  # folder, from results/memory/<experiment> -> what is printed of it
     keys: dict[str, str]  # key of eval.json -> what is printed of it; the first is drawn
     log: bool = False  # the figure's axis
-    bound: Callable | None = None  # what no memory can beat: () -> {key: value}
+    bound: Callable | None = None  # what no memory can beat, of the keys of which that is known: () -> {key: value}
 
 
 def lengths(*steps):
@@ -46,11 +47,12 @@ def lengths(*steps):
 
 @functools.cache
 def velocity_from_the_second_step():
-    """The double integrator's optimum when its first action is made without the velocity, over the starts of eval.json.
+    """The least ratio of sums of a first action that is made without the velocity, over the starts of eval.json.
 
     Two positions and the action between them tell the velocity, so a memory can know it from the second step on. The
-    first action is that of velocity zero, the mean over the starts: for quadratic costs the best (certainty
-    equivalence, e.g. Bertsekas, Dynamic Programming and Optimal Control, vol. 1); the bound on u hardly matters.
+    first action is that of velocity zero, the mean over the starts: the best for the expected quadratic cost (certainty
+    equivalence, e.g. Bertsekas, Dynamic Programming and Optimal Control, vol. 1), and for that alone: laws that cost
+    more on average have a lower p95. On 1000 starts and with the bound on u it holds to three digits.
     """
     problem = envs.DOUBLE_INTEGRATOR
     law, x0 = baselines.lqr_policy(problem), baselines.starts(0, 1000)
@@ -59,7 +61,7 @@ def velocity_from_the_second_step():
         return law(obs * [1.0, float(t > 0), 1.0], t)
 
     flight, best = (envs.fly(problem.env_id, flown, x0) for flown in (blind_at_first, law))
-    return evaluate.ratio_metrics(flight["cost"], best["cost"], 0) | {"hit_rate": flight["hit"].mean()}
+    return {"ratio_of_sums": flight["cost"].sum() / best["cost"].sum()}
 
 
 EXPERIMENTS = {
@@ -114,6 +116,11 @@ def cell(values):
     return middle if len(values) == 1 else f"{middle} ({low} to {high})"
 
 
+def digits(bound):
+    """A bound to the three digits to which it is known; "-" without one."""
+    return "-" if bound is None else f"{bound:#.3g}"
+
+
 def table(experiment, found):
     """The lines of one experiment's table."""
     lines = [["", "seeds", *experiment.keys.values()]]
@@ -122,7 +129,7 @@ def table(experiment, found):
         lines.append([experiment.rows[row], str(len(seeds)), *cells])
     if experiment.bound:
         bound = experiment.bound()
-        lines.append(["no memory can beat", "", *(f"{bound[key]:.4g}" for key in experiment.keys)])
+        lines.append(["no memory can beat", "", *(digits(bound.get(key)) for key in experiment.keys)])
     widths = [max(map(len, column)) for column in zip(*lines)]
     printed = ["  ".join(word.ljust(width) for word, width in zip(line, widths)).rstrip() for line in lines]
     return [experiment.title, *(f"  {line}" for line in printed)]
@@ -145,7 +152,7 @@ def draw(results):
                 experiment.bound()[key],
                 color="0.5",
                 linestyle="--",
-                label=f"no memory can beat {experiment.bound()[key]:.3g}",
+                label=f"no memory can beat {digits(experiment.bound()[key])}",
             )
             ax.legend()
         ax.set_xticks(range(len(found)), [experiment.rows[row] for row in found], rotation=30, ha="right")
@@ -171,7 +178,7 @@ def main():
             raise ValueError(f"{folder} has no finished run; benchmarks/memory_*_jobs.txt list them")
         for name, found in results.items():
             print("\n".join(table(EXPERIMENTS[name], found)))
-        draw(results).savefig(folder / "memory.png", dpi=100)
+        figures.save(folder, {"memory.png": draw(results)})
     except (OSError, ValueError) as error:
         sys.exit(f"error: {error}")
 

@@ -5,13 +5,13 @@
     python benchmarks/peers.py --table        # of what is there
 
 Each row is one way of learning, seeds 1 to 3, by `benchmarks/sb3_ppo.py` with the settings that were best for it in
-short trials (docs/other-learners.md). Figures are medians with the range of all seeds.
+short trials (docs/other-learners.md). Figures are medians with the range of all seeds. Exit status 1 if a run failed.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
+import os
 import shlex
 import subprocess
 import sys
@@ -23,6 +23,8 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "benchmarks"))
 from memory import cell  # noqa: E402
 
+from baselines import OneLineParser, integer  # noqa: E402
+
 FOLDER = ROOT / "results" / "peers"
 CUTOFF = "--env-id RocketAscentCutoff-v0 --batch-size 512 --learning-rate 1e-3"
 LSTM = "--env-id RocketAscentCutoff-v0 --recurrent --batch-size 3848 --epochs 6 --learning-rate 1e-3 --samples 3700000"
@@ -33,12 +35,16 @@ DISPERSED_KEYS = {"dispersed_error_median": "median", "dispersed_error_p95": "p9
 
 @dataclass
 class Peer:
-    """A row: what is printed of it, the flags of `sb3_ppo.py`, the keys of its final evaluation, its seeds."""
+    """A row: what is printed of it, the flags of `sb3_ppo.py`, the keys of its final evaluation, its seeds.
+
+    `start` names an earlier row: each seed begins with the policy that it saved.
+    """
 
     title: str
     flags: str
     keys: dict[str, str]
     seeds: tuple[int, ...] = (1, 2, 3)
+    start: str = ""
 
 
 PEERS = {
@@ -49,31 +55,74 @@ PEERS = {
     "cutoff_raw": Peer("cut-off, raw, our samples", f"{CUTOFF} --samples 7450000 --features raw", ROCKET_KEYS),
     "lstm_dispersed": Peer(
         "LSTM, from there, dispersed",
-        f"{LSTM} --dispersion 1 --start runs/peer_lstm_1.zip",
+        f"{LSTM} --dispersion 1 --mass-weight 0.5 --log-std -3.5",
         DISPERSED_KEYS,
         (1,),
+        start="lstm",
     ),
 }
 
 
-def train(name, seed):
-    """One run, unless its file is there."""
-    path = FOLDER / f"{name}_{seed}.json"
+def result(name, seed):
+    """Where a run writes its figures, from here: the file keeps its command, and no machine's folders."""
+    return Path(os.path.relpath(FOLDER / f"{name}_{seed}.json"))
+
+
+def policy(name, seed):
+    """Where a run saves its policy, VecNormalize beside it as .pkl."""
+    return Path(f"runs/peer_{name}_{seed}.zip")
+
+
+def train(name, seed, before=None):
+    """One run, unless its file is there; returns why there is none now, or None. `before` is waited for: a future."""
+    path, peer = result(name, seed), PEERS[name]
+    if before:
+        before.result()
     if path.exists():
-        return
-    flags = f"{PEERS[name].flags} --seed {seed} --save runs/peer_{name}_{seed}.zip --json {path}"
-    with open(f"runs/peer_{name}_{seed}.log", "w") as log:
-        command = [sys.executable, ROOT / "benchmarks" / "sb3_ppo.py", *shlex.split(flags)]
-        ended = subprocess.run(command, stdout=log, stderr=subprocess.STDOUT)
+        return None
+    flags = [*shlex.split(peer.flags), "--seed", str(seed), "--save", str(policy(name, seed)), "--json", str(path)]
+    if peer.start:
+        start = policy(peer.start, seed)
+        for file in (start, start.with_suffix(".pkl")):
+            if not file.is_file():
+                again = f"delete {result(peer.start, seed)}, if it is there, to train that again"
+                return f"{name}, seed {seed}: {file} is missing, with which it begins; {again}"
+        flags += ["--start", str(start)]
+    log = policy(name, seed).with_suffix(".log")
+    with open(log, "w") as file:
+        command = [sys.executable, ROOT / "benchmarks" / "sb3_ppo.py", *flags]
+        ended = subprocess.run(command, stdout=file, stderr=subprocess.STDOUT)
     print(f"{name}, seed {seed}: ended with {ended.returncode}", flush=True)
+    return f"{name}, seed {seed}: ended with {ended.returncode}, see {log}" if ended.returncode else None
+
+
+def train_all(at_once):
+    """Every run that is missing, `at_once` at a time, each after the one that it begins with; why some failed."""
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    Path("runs").mkdir(exist_ok=True)
+    futures = {}
+    with ThreadPoolExecutor(at_once) as pool:
+        for name, peer in PEERS.items():
+            for seed in peer.seeds:
+                futures[name, seed] = pool.submit(train, name, seed, futures[peer.start, seed] if peer.start else None)
+    return [future.result() for future in futures.values() if future.result()]
+
+
+def read(path):
+    """What a run wrote; ValueError names a file that is something else."""
+    try:
+        run = json.loads(path.read_text())
+        return {"curve": run["curve"], "final": run["final"]}
+    except (ValueError, TypeError, KeyError) as error:
+        raise ValueError(f"{path} is not what sb3_ppo.py writes ({error!r}); delete it to train it again") from error
 
 
 def table():
     """Rows with different figures have headers of their own."""
     lines, keys = [], None
     for name, peer in PEERS.items():
-        paths = [FOLDER / f"{name}_{seed}.json" for seed in peer.seeds]
-        runs = [json.loads(path.read_text()) for path in paths if path.exists()]
+        paths = [result(name, seed) for seed in peer.seeds]
+        runs = [read(path) for path in paths if path.exists()]
         if runs and peer.keys != keys:
             keys = peer.keys
             lines.append(["", "seeds", "samples", "minutes", *keys.values()])
@@ -86,18 +135,18 @@ def table():
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--at-once", type=int, default=1)
+    parser = OneLineParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--at-once", type=integer(1, 64), default=1)
     parser.add_argument("--table", action="store_true", help="train nothing")
     options = parser.parse_args()
-    if not options.table:
-        FOLDER.mkdir(parents=True, exist_ok=True)
-        Path("runs").mkdir(exist_ok=True)
-        jobs = [(name, seed) for name, peer in PEERS.items() for seed in peer.seeds]
-        with ThreadPoolExecutor(options.at_once) as pool:
-            list(pool.map(lambda job: train(*job), jobs))
-    for line in table():
-        print(f"{line[0]:36}" + "  ".join(f"{word:24}" for word in line[1:]).rstrip())
+    try:
+        failed = [] if options.table else train_all(options.at_once)
+        for line in table():
+            print(f"{line[0]:36}" + "  ".join(f"{word:24}" for word in line[1:]).rstrip())
+    except (OSError, ValueError) as error:
+        sys.exit(f"error: {error}")
+    if failed:
+        sys.exit("\n".join(f"error: {line}" for line in failed))
 
 
 if __name__ == "__main__":

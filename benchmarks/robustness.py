@@ -324,13 +324,20 @@ def soak_in_child(pipe, argv):
 
 
 def soak(updates):
-    """Train for so many tiny updates: resident memory (bytes) and open files after each."""
+    """Train for so many tiny updates: resident memory (bytes) and open files after each.
+
+    AssertionError says after how many of them the child died, if it did.
+    """
     ours, theirs = PROCESSES.Pipe(duplex=False)
     process = PROCESSES.Process(target=soak_in_child, args=(theirs, [*TINY, f"--total-updates={updates}"]))
     process.start()
-    seen = [ours.recv() for _ in range(updates)]
+    theirs.close()  # the child's alone: where it dies, `recv` ends instead of waiting
+    seen = []
+    with contextlib.suppress(EOFError):
+        while len(seen) < updates:
+            seen.append(ours.recv())
     process.join()
-    assert process.exitcode == 0
+    assert process.exitcode == 0, f"soak: exit code {process.exitcode} after {len(seen)} of {updates} updates"
     return np.array(seen)
 
 

@@ -10,12 +10,14 @@ Each line of jobs.txt is a results folder and the command that trains for it; em
 With --numbers the results folders get the evaluations and curves alone: no weights, no figures.
 
 A run in runs/ belongs to a line if it has the same arguments, so nothing else is kept: start it again after a power
-cut and it does the rest. Each run's output is added to runs/<its name>.log. Exit status 1 if a run failed.
+cut and it does the rest. Each run's output is added to runs/<its name>.log. Exit status 1 if a run failed or could not
+be published; the others go on.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
 import importlib
 import json
 import shlex
@@ -30,6 +32,7 @@ sys.path.insert(0, str(ROOT))
 import evaluate  # noqa: E402
 import runs  # noqa: E402
 
+SCRIPTS = sorted(path.name for path in ROOT.glob("ppo_gtrxl_*.py"))
 MACHINE = ("cuda", "num_threads", "resume")  # arguments that another start may change
 
 
@@ -43,13 +46,15 @@ class Job:
         """The newest run in runs/ that has the arguments of this job, or None."""
         mine = {name: value for name, value in self.args.items() if name not in MACHINE}
         for path in sorted(Path("runs").glob("*/args.json"), key=lambda path: path.stat().st_mtime, reverse=True):
-            theirs = json.loads(path.read_text())
+            theirs = read_args(path)
             if mine == {name: value for name, value in theirs.items() if name not in MACHINE}:
                 return path.parent
         return None
 
     def is_trained(self):
-        return (run := self.run_dir()) is not None and (run / "eval.json").exists()
+        """Whether its evaluation is whole: eval.npz is written after eval.json."""
+        run = self.run_dir()
+        return run is not None and all((run / name).exists() for name in ("eval.json", "eval.npz"))
 
     def start(self):
         """Begin it, or go on with it where a run of it was saved."""
@@ -61,38 +66,91 @@ class Job:
             return subprocess.Popen([sys.executable, ROOT / script, *flags], stdout=log, stderr=subprocess.STDOUT)
 
     def publish(self, numbers):
-        """Add the run, or its numbers alone, to its results folder, unless it is there already.
+        """Add the run, or its numbers alone, to its results folder, unless all of it is there already.
 
-        What the folder ships is replaced if it is another run of this seed.
+        What the folder ships is replaced if it is another run of this seed. OSError or ValueError says what is missing.
         """
-        run, seed, shipped = self.run_dir(), self.args["seed"], self.results / "eval.json"
-        published = self.results / "seeds" / f"{seed}.json"
-        if not published.exists() or published.read_bytes() != (run / "eval.json").read_bytes():
-            ship = shipped.exists() and evaluate.read_json(shipped)["seed"] == seed
+        run, shipped = self.run_dir(), self.results / "eval.json"
+        if run is None:
+            raise ValueError("runs/ holds no run with these arguments")
+        ship = shipped.exists() and evaluate.read_json(shipped)["seed"] == self.args["seed"]
+        ships = not numbers and (ship or not shipped.exists())  # a folder that ships none ships what comes first
+        if not self.has_numbers(run) or (ships and not self.is_shipped(run)):
             evaluate.publish(run, self.results, ship=ship, numbers=numbers)
+
+    def has_numbers(self, run):
+        """Whether its results folder has this run's evaluation among its seeds."""
+        return same(run / "eval.json", self.results / "seeds" / f"{self.args['seed']}.json")
+
+    def is_shipped(self, run):
+        """Whether its results folder ships this run, with policy and figures."""
+        there = all((self.results / name).exists() for name in ("agent.safetensors", "eval.npz", "figures"))
+        return there and same(run / "eval.json", self.results / "eval.json")
+
+
+def same(path, other):
+    """Whether the second file is there and has the bytes of the first."""
+    return other.exists() and other.read_bytes() == path.read_bytes()
+
+
+def read_args(path):
+    """A run's arguments; none of a file that is damaged, which is printed: it can be that of any other run."""
+    try:
+        args = json.loads(path.read_text())
+        if not isinstance(args, dict):
+            raise ValueError("it holds no arguments")
+        return args
+    except (OSError, ValueError) as error:
+        print_once(f"{path} is skipped, a job of this run begins anew: {error}")
+        return {}
+
+
+@functools.cache
+def print_once(line):
+    print(line, flush=True)
 
 
 def read_jobs(path):
-    """The jobs of a file; SystemExit names the line that cannot be one."""
+    """The jobs of a file; ValueError names the line that cannot be one."""
     jobs = []
     for number, line in enumerate(Path(path).read_text().splitlines(), start=1):
-        if not (words := shlex.split(line, comments=True)):
-            continue
-        results, script, *flags = [*words, ""] if len(words) < 2 else words
-        if not (script.endswith(".py") and (ROOT / script).is_file()):
-            sys.exit(f"error: {path}, line {number}: {line!r} must be a results folder, a script and its flags")
-        kind = importlib.import_module(Path(script).stem)
-        args, _ = runs.parse_args(kind.Args, flags, kind.ENV_OPTIONS, kind.BUFFERS)
-        jobs.append(Job(Path(results), [script, *flags], asdict(args)))
+        try:
+            if words := shlex.split(line, comments=True):
+                jobs.append(read_job(words))
+        except (OSError, ValueError, SystemExit) as error:
+            raise ValueError(f"{path}, line {number}: {str(error).removeprefix('error: ')}") from error
     return jobs
+
+
+def read_job(words):
+    """The job of a line; ValueError, OSError or SystemExit says why it cannot be one."""
+    if len(words) < 2 or words[1] not in SCRIPTS:
+        raise ValueError(f"{shlex.join(words)!r} must be a results folder, one of {', '.join(SCRIPTS)} and its flags")
+    results, script, *flags = words
+    kind = importlib.import_module(Path(script).stem)
+    if {"--help", "-h"} & set(flags):
+        raise ValueError("--help trains nothing")
+    args, _ = runs.parse_args(kind.Args, flags, kind.ENV_OPTIONS, kind.BUFFERS)
+    if args.eval_only or not args.save_model:
+        raise ValueError(f"{'--eval-only' if args.eval_only else '--no-save-model'} leaves no run to publish")
+    return Job(Path(results), [script, *flags], asdict(args))
+
+
+def publish(job, numbers):
+    """Publish a job's run, and whether that worked: a line is printed where it failed, and the other jobs go on."""
+    try:
+        job.publish(numbers)
+    except (OSError, ValueError) as error:
+        print(f"not published: {shlex.join(job.command)}: {error}", flush=True)
+        return False
+    return True
 
 
 def work(jobs, at_once, numbers):
     """Train the jobs, `at_once` at a time, and publish each as it ends; returns those that failed."""
-    waiting, running, failed = [job for job in jobs if not job.is_trained()], [], []
+    waiting, running = [job for job in jobs if not job.is_trained()], []
     print(f"{len(jobs)} jobs, {len(jobs) - len(waiting)} trained already", flush=True)
-    for job in jobs:
-        job.publish(numbers) if job not in waiting else None
+    failed = [job for job in jobs if job not in waiting and not publish(job, numbers)]
     try:
         while waiting or running:
             while waiting and len(running) < at_once:
@@ -103,7 +161,8 @@ def work(jobs, at_once, numbers):
             for job, process in [pair for pair in running if pair[1].poll() is not None]:
                 running.remove((job, process))
                 print(f"ended with {process.returncode}: {shlex.join(job.command)}", flush=True)
-                job.publish(numbers) if process.returncode == 0 else failed.append(job)
+                if process.returncode or not publish(job, numbers):
+                    failed.append(job)
     finally:
         for _, process in running:
             process.terminate()  # saves its state

@@ -6,16 +6,18 @@
     python benchmarks/sb3_ppo.py --env-id RocketAscentCutoff-v0 --recurrent --dispersion 1 --start RUN.zip
 
 It is given what our script gives its own learner: the curriculum (price of the propellant, scale of R_terminal), the
-first mean action and its noise, the local frame, and our features of the observation, or with --features raw the
-observation itself. The rest is that library's: feed-forward networks for actor and critic (an LSTM with --recurrent, of
-sb3-contrib), VecNormalize of inputs and rewards, its discount, clipping and epochs. `peers.py` runs and lists all.
+first mean action and its noise, the local frame, and our features of the observation (of dispersed flights beside their
+mean, too), or with --features raw the observation itself. The rest is that library's: feed-forward networks for actor
+and critic (an LSTM with --recurrent, of sb3-contrib), VecNormalize of inputs and rewards, its discount, clipping and
+epochs. `peers.py` runs and lists all.
 """
 
 from __future__ import annotations
 
-import argparse
 import importlib
 import json
+import shlex
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -29,9 +31,12 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnvWrapper, VecMonitor, VecNormalize
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
 import envs  # noqa: E402
 import evaluate  # noqa: E402
+import runs  # noqa: E402
+from baselines import OneLineParser  # noqa: E402
 from sb3_env import NativeVecEnv  # noqa: E402
 
 PARTS = 20  # evaluated after each such part of the samples
@@ -39,7 +44,7 @@ SCRIPTS = ("ppo_gtrxl_di", "ppo_gtrxl_vdp", "ppo_gtrxl_rocket")
 
 
 class OurFeatures(VecEnvWrapper):
-    """Observations as our script's encoder sees them."""
+    """Observations as our script's encoder sees them; `raw` are the environments' last ones (N, obs)."""
 
     def __init__(self, venv, script, env_id):
         constants = {name: torch.tensor(value) for name, value in script.BUFFERS[env_id].items()}
@@ -51,13 +56,14 @@ class OurFeatures(VecEnvWrapper):
         return self.script.features(self.constants, torch.as_tensor(obs, dtype=torch.float32)).numpy()
 
     def reset(self):
-        return self(self.venv.reset())
+        self.raw = self.venv.reset()
+        return self(self.raw)
 
     def step_wait(self):
-        obs, rewards, dones, infos = self.venv.step_wait()
+        self.raw, rewards, dones, infos = self.venv.step_wait()
         for k in np.flatnonzero(dones):
             infos[k]["terminal_observation"] = self(infos[k]["terminal_observation"][None])[0]
-        return self(obs), rewards, dones, infos
+        return self(self.raw), rewards, dones, infos
 
 
 class OurCurriculum(BaseCallback):
@@ -76,8 +82,68 @@ class OurCurriculum(BaseCallback):
         return True
 
 
+class OurMeanFlight(BaseCallback):
+    """After each rollout, what our script learns after each update: the mean of the dispersed flights, step by step.
+
+    A rollout is as long as a flight but begins in the middle of some: its observations are sorted by the step of their
+    flight. Of two flights of one environment that come to the same step, the later counts.
+    """
+
+    def __init__(self, script, args, seen):
+        super().__init__()
+        self.script, self.args, self.seen, self.constants = script, args, seen, seen.constants
+        self.new = len(script.DIFFERENCES)  # features that were all zero until there is a mean
+        self.constants.encoder = [SimpleNamespace(weight=torch.zeros(1, self.new))]  # ours; theirs is cleared below
+
+    def _on_training_start(self):
+        # a part of VecNormalize, so that --save and --start keep it
+        self.constants.mean_flight = vars(self.training_env).setdefault("mean_flight", self.constants.mean_flight)
+        self.step = np.zeros(self.training_env.num_envs, dtype=int)
+
+    def _on_rollout_start(self):
+        shape = len(self.constants.mean_flight), self.training_env.num_envs
+        self.obs = np.repeat(self.seen.raw[None], shape[0], axis=0)  # a step that nobody flies needs a real state
+        self.alive = np.zeros(shape, dtype=np.float32)
+        self._keep()
+
+    def _on_step(self):
+        self.step = np.where(self.locals["dones"], 0, self.step + 1)
+        self._keep()
+        return True
+
+    def _keep(self):
+        flying = np.flatnonzero(self.step < len(self.obs))
+        self.obs[self.step[flying], flying] = self.seen.raw[flying]
+        self.alive[self.step[flying], flying] = 1.0
+
+    def _on_rollout_end(self):
+        if not self.constants.mean_flight.any():
+            self._come_into_sight()
+        batch = SimpleNamespace(obs=torch.as_tensor(self.obs), alive=torch.as_tensor(self.alive))
+        self.script.learn_buffers(self.constants, self.args, batch)
+
+    @torch.no_grad()
+    def _come_into_sight(self):
+        """As in our script, the new features change nothing at first."""
+        for weight in input_weights(self.model.policy):
+            weight[:, -self.new :] = 0.0
+        # after all the zeros VecNormalize would enlarge them ten thousandfold; they are of order one as they are
+        seen = self.training_env.obs_rms
+        seen.mean[-self.new :], seen.var[-self.new :] = 0.0, 1.0
+
+
+def input_weights(policy):
+    """The weights (width, inputs) with which actor and critic begin."""
+    if hasattr(policy, "lstm_actor"):
+        return [policy.lstm_actor.weight_ih_l0, policy.lstm_critic.weight_ih_l0]
+    return [policy.mlp_extractor.policy_net[0].weight, policy.mlp_extractor.value_net[0].weight]
+
+
 class Evaluation(BaseCallback):
-    """Evaluates after each part of the samples; `curve` has the processor's minutes of all but that."""
+    """Evaluates after each part of the samples, dispersed flights on as many draws as ours.
+
+    `curve` has the processor's minutes of all but that.
+    """
 
     def __init__(self, env_id, env_options, samples):
         super().__init__()
@@ -85,6 +151,7 @@ class Evaluation(BaseCallback):
         self.keys = ["error_norm", "mass_ratio"] if env_id in envs.ROCKETS else ["ratio_of_sums", "ratio_p95"]
         if env_options.get("dispersion"):
             self.keys += ["dispersed_error_median", "dispersed_error_p95", "dispersed_box_rate"]
+        self.starts = evaluate.DISPERSED_STARTS if env_options.get("dispersion") else 1000
         self.curve, self.metrics, self.seconds = [], {}, 0.0
 
     def _on_training_start(self):
@@ -103,7 +170,7 @@ class Evaluation(BaseCallback):
     def evaluate(self):
         self.seconds += time.process_time() - self.began
         flown = make_policy(self.model, self.training_env)
-        self.metrics, _ = evaluate.evaluate(self.env_id, flown, 0, 1000, **self.env_options)
+        self.metrics, _ = evaluate.evaluate(self.env_id, flown, 0, self.starts, **self.env_options)
         point = {"samples": self.num_timesteps, "minutes": self.seconds / 60}
         self.curve.append(point | {key: self.metrics[key] for key in self.keys if key in self.metrics})
         print(json.dumps(self.curve[-1]), flush=True)
@@ -126,7 +193,10 @@ def make_policy(model, normalised):
 
 
 def make_model(options, script, args, normalised, steps):
-    """The library's learner with our first mean action and its noise, or with the parameters of --start."""
+    """The library's learner with our first mean action and its noise, or with the parameters of --start.
+
+    Like our script it goes on with the noise of --start, unless --log-std says otherwise.
+    """
     kind, policy = (RecurrentPPO, "MlpLstmPolicy") if options.recurrent else (PPO, "MlpPolicy")
     width = {"lstm_hidden_size": 64} if options.recurrent else {}
     model = kind(
@@ -144,16 +214,33 @@ def make_model(options, script, args, normalised, steps):
     model.policy.action_net.bias.data = torch.tensor(script.INITIAL_ACTION)
     if options.start:
         model.set_parameters(options.start)
+    if options.log_std is not None:
+        model.policy.log_std.data.fill_(options.log_std)
     return model
 
 
+def commit():
+    """The short hash of the code's commit; None where there is no git."""
+    command = ["git", "-C", str(ROOT), "rev-parse", "--short", "HEAD"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
+
+def flag(name):
+    return f"--{name.replace('_', '-')}"
+
+
 def parse_args():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = OneLineParser(description=__doc__.splitlines()[0])
     parser.add_argument("--env-id", default="DoubleIntegrator-v0", choices=[*envs.PROBLEMS, *envs.ROCKETS])
     parser.add_argument("--samples", type=int, default=2_560_000)
     parser.add_argument("--features", default="ours", choices=["ours", "raw"])
     parser.add_argument("--recurrent", action="store_true", help="an LSTM: sb3-contrib's RecurrentPPO")
-    parser.add_argument("--dispersion", type=float, default=0.0, help="every flight another vehicle (a rocket's)")
+    parser.add_argument("--dispersion", type=float, help="every flight another vehicle (a rocket's)")
+    parser.add_argument("--mass-weight", type=float, help="highest price of the propellant (default: our script's)")
+    parser.add_argument("--log-std", type=float, help="first log-std (default: our script's, or that of --start)")
     parser.add_argument("--num-envs", type=int, default=32)
     parser.add_argument("--batch-size", type=int, default=64)
     parser.add_argument("--epochs", type=int, default=10)
@@ -166,8 +253,13 @@ def parse_args():
     )
     parser.add_argument("--json", type=Path, help="write the figures there")
     options = parser.parse_args()
-    if options.dispersion and options.env_id not in envs.ROCKETS:
-        parser.error(f"--dispersion {options.dispersion}: only a rocket has it, not {options.env_id}")
+    for name, value in vars(options).items():
+        low, high = runs.RANGES.get(name, (None, None))
+        if low is not None and value is not None and not low <= value <= high:
+            parser.error(f"{flag(name)} {value}: must be between {low} and {high}")
+    for name in ("dispersion", "mass_weight"):
+        if getattr(options, name) is not None and options.env_id not in envs.ROCKETS:
+            parser.error(f"{flag(name)} {getattr(options, name)}: only a rocket has it, not {options.env_id}")
     for path in (options.start, options.start and options.start.with_suffix(".pkl")):
         if path and not path.is_file():
             parser.error(f"--start {options.start}: there is no {path}")
@@ -179,12 +271,13 @@ def parse_args():
 
 def main():
     options = parse_args()
+    code = {"commit": commit(), "flags": shlex.join(sys.argv[1:])}  # now: hours later it may be another
     torch.set_num_threads(1)
     script = next(s for s in map(importlib.import_module, SCRIPTS) if options.env_id in s.ENV_IDS)
     args = script.Args(env_id=options.env_id)
+    given = {name: getattr(options, name) for name in ("dispersion", "mass_weight", "log_std")}
+    vars(args).update({name: value for name, value in given.items() if value is not None})
     env_options = {name: getattr(args, name) for name in script.ENV_OPTIONS}
-    if options.dispersion:
-        args.dispersion = env_options["dispersion"] = options.dispersion
 
     batch = gym.make_vec(options.env_id, num_envs=options.num_envs, **env_options).unwrapped
     venv = VecMonitor(NativeVecEnv(batch))
@@ -197,13 +290,16 @@ def main():
 
     model = make_model(options, script, args, normalised, batch.episode_steps)
     evaluation = Evaluation(options.env_id, env_options, options.samples)
-    model.learn(options.samples, callback=[OurCurriculum(script, args, batch, options.samples), evaluation])
+    callbacks = [OurCurriculum(script, args, batch, options.samples), evaluation]
+    if options.dispersion and options.features == "ours":
+        callbacks.append(OurMeanFlight(script, args, venv))
+    model.learn(options.samples, callback=callbacks)
     print(evaluate.table(evaluation.metrics))
     if options.save:
         model.save(options.save)
         normalised.save(options.save.with_suffix(".pkl"))
     if options.json:
-        options.json.write_text(json.dumps({"curve": evaluation.curve, "final": evaluation.metrics}, indent=1) + "\n")
+        evaluate.write_json(options.json, {**code, "curve": evaluation.curve, "final": evaluation.metrics})
 
 
 if __name__ == "__main__":

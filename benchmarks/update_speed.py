@@ -36,6 +36,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from one_update import one_update, script_args  # noqa: E402
 
+from figures import save  # noqa: E402
 from runs import keep_memory  # noqa: E402
 
 PAPER = {"num_blocks": 6, "embed_dim": 384, "num_heads": 8, "memory_length": 256, "mlp_dim": 384, "hidden_dim": 384}
@@ -301,7 +302,7 @@ def growth(path, repeats):
         ax.set(xlabel=f"{labels[name]} ({others})", ylabel="seconds of an epoch", xlim=(0, None), ylim=(0, None))
         ax.grid(alpha=0.3)
         ax.legend()
-    figure.savefig(path, dpi=130)
+    save(path.parent, {path.name: figure})
 
 
 def main():
@@ -310,7 +311,7 @@ def main():
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--compile", action="store_true", help="measure --torch-compile instead")
-    parser.add_argument("--growth", metavar="PNG", help="measure and draw the growth with T, L and N instead")
+    parser.add_argument("--growth", type=Path, metavar="PNG", help="measure and draw the growth with T, L, N instead")
     options = parser.parse_args()
     if options.growth:
         keep_memory()

@@ -1,5 +1,6 @@
 """What several test files share: environments whose episodes end at different times, one update, a benchmark."""
 
+import contextlib
 import dataclasses
 import importlib
 import os
@@ -86,3 +87,15 @@ def update(script, args, modules, envs, batch, iteration=1):
 def robustness():
     """The benchmark as a module that its child processes can import, too."""
     return importlib.import_module("robustness")
+
+
+@pytest.fixture
+def cut_figures(monkeypatch):
+    """From now on the disk is full when a figure is half drawn, wherever it is drawn to."""
+
+    def savefig(figure, target, **options):
+        with contextlib.nullcontext(target) if hasattr(target, "write") else open(target, "wb") as file:
+            file.write(b"\x89PNG")
+            raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", savefig)

@@ -1,10 +1,12 @@
 """`benchmarks/attention.py` and `benchmarks/memory.py`: the weights against the network's own output, the tables."""
 
+import dataclasses
 import json
 import os
 import shlex
 import sys
 from pathlib import Path
+from unittest import mock
 
 import attention
 import memory
@@ -82,6 +84,26 @@ def test_attention_of_a_shipped_policy(name, heads, tmp_path, monkeypatch, capsy
     )
 
 
+def test_the_flight_begins_with_the_evaluations_first_start(new_problem):
+    """Of a problem whose starts are of another box than the paper's."""
+    env_id = new_problem(dataclasses.replace(envs.DOUBLE_INTEGRATOR, env_id="WideBox-v0", x0_max=2.5))
+    args, resting = script.Args(env_id=env_id), mock.Mock()
+    resting.make_policy.return_value = lambda obs, t: np.zeros((1, 1))
+    obs, t = attention.observations(resting, args, {}, eval_seed=3)
+    _, flight = evaluate.evaluate(env_id, lambda obs, t: np.zeros((len(obs), 1)), 3, 10)
+    np.testing.assert_allclose(obs[:, :2], flight["x"][0, :-1])
+    assert len(t) == len(obs) == 50 and np.abs(obs[0, :2]).max() < 2.5
+
+
+def test_a_figure_of_attention_is_whole_or_as_it_was(tmp_path, monkeypatch, capsys, cut_figures):
+    path = tmp_path / "attention.png"
+    path.write_bytes(b"the old one")
+    monkeypatch.setattr(sys, "argv", ["attention.py", str(ROOT / "results" / "vdp_waypoints"), str(path)])
+    with pytest.raises(SystemExit, match="error: .*No space left"):
+        attention.main()
+    assert path.read_bytes() == b"the old one" and len(list(tmp_path.iterdir())) == 1
+
+
 def evaluations(folder, values):
     for seed, value in enumerate(values, start=1):
         (folder / "seeds").mkdir(parents=True, exist_ok=True)
@@ -99,8 +121,17 @@ def test_table_and_figure_of_what_is_there(tmp_path, monkeypatch, capsys):
     assert "velocity hidden" in title and header.split()[:2] == ["seeds", "ratio"]
     assert rows[0].split("  ")[1:] and "L_mem 4" in rows[0] and "1.5 (1.25 to 3)" in rows[0] and " 3 " in rows[0]
     assert "velocity shown" in rows[1] and "1.005" in rows[1] and "-" in rows[1]
-    assert "no memory can beat" in rows[2] and len(rows) == 3
+    assert rows[2].split() == ["no", "memory", "can", "beat", "1.10", "-", "-"] and len(rows) == 3
     assert imread(folder / "memory.png").std() > 0.05
+
+
+def test_the_figure_is_whole_or_as_it_was(tmp_path, monkeypatch, capsys, cut_figures):
+    evaluations(tmp_path / "hidden_velocity" / "memory_4", [1.5])
+    (tmp_path / "memory.png").write_bytes(b"the old one")
+    monkeypatch.setattr(sys, "argv", ["memory.py", str(tmp_path)])
+    with pytest.raises(SystemExit, match="error: .*No space left"):
+        memory.main()
+    assert (tmp_path / "memory.png").read_bytes() == b"the old one" and not list(tmp_path.glob(".*"))
 
 
 def test_what_no_memory_can_beat_is_the_best_of_first_actions_that_see_the_position_alone():
@@ -116,6 +147,21 @@ def test_what_no_memory_can_beat_is_the_best_of_first_actions_that_see_the_posit
         ratios.append(total.sum() / np.einsum("ni,ij,nj->n", x0, P[0], x0).sum())
     assert memory.velocity_from_the_second_step()["ratio_of_sums"] == pytest.approx(min(ratios), abs=2e-3)
     assert min(ratios) < ratios[0] - 0.04  # the first action matters
+
+
+def test_another_law_has_the_lower_p95():
+    """Why the bound is of the ratio of sums alone: two blind first actions, flown."""
+    problem = envs.DOUBLE_INTEGRATOR
+    law, x0 = baselines.lqr_policy(problem), baselines.starts(0, 1000)
+    (K, _), best = baselines.lqr(problem), envs.fly(problem.env_id, law, x0)
+    found = []
+    for gain in (K[0][0], 1.5):
+        blind = lambda obs, t, gain=gain: law(obs, t) if t else -gain * obs[:, :1]  # noqa: E731
+        found.append(evaluate.ratio_metrics(envs.fly(problem.env_id, blind, x0)["cost"], best["cost"], 0))
+    equivalent, weaker = found
+    assert memory.velocity_from_the_second_step() == {"ratio_of_sums": pytest.approx(equivalent["ratio_of_sums"])}
+    assert weaker["ratio_of_sums"] > equivalent["ratio_of_sums"] + 0.003
+    assert weaker["ratio_p95"] < equivalent["ratio_p95"] - 0.02
 
 
 def test_an_empty_folder_is_one_line(tmp_path, monkeypatch):

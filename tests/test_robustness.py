@@ -82,6 +82,23 @@ def test_soak(robustness):
     assert len(set(files.reshape(3, 100).min(axis=1))) == 1, files
 
 
+def test_a_soak_whose_child_dies_ends(robustness, monkeypatch):
+    """It is refused its arguments, and sends nothing."""
+
+    def too_long(*_):
+        raise TimeoutError("soak still waits for a child that has died")
+
+    monkeypatch.setattr(robustness, "TINY", ["--gamma=7"])
+    before = signal.signal(signal.SIGALRM, too_long)
+    signal.alarm(60)
+    try:
+        with pytest.raises(AssertionError, match="^soak: exit code 1 after 0 of 5 updates$"):
+            robustness.soak(5)
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
+
+
 @pytest.mark.parametrize("name", ["di", "rocket"])
 def test_4096_environments(robustness, tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)

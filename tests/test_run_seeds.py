@@ -1,6 +1,7 @@
 """`benchmarks/run_seeds.py`: skips what is finished, goes on with what was cut, publishes, reports what failed."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -61,6 +62,135 @@ def test_a_job_with_a_bad_flag_stops_before_any_training(tmp_path):
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 1 and "--gamma 7.0: must be between 0.0 and 1.0" in errors
     assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize(
+    "line, says",
+    [
+        (
+            "results/x evaluate.py --foo",
+            "'results/x evaluate.py --foo' must be a results folder, one of ppo_gtrxl_di.py, ",
+        ),
+        ("results/x benchmarks/memory.py", "'results/x benchmarks/memory.py' must be a results folder, "),
+        ("results/x", "'results/x' must be a results folder, "),
+        ("results/x ppo_gtrxl_di.py --exp-name 'open", "No closing quotation"),
+        ("results/x ppo_gtrxl_di.py --gamma 7", "--gamma 7.0: must be between 0.0 and 1.0"),
+        ("results/x ppo_gtrxl_di.py --foo", "Unrecognized"),
+        ("results/x ppo_gtrxl_di.py --checkpoint nothing", "--checkpoint nothing: No such file or directory"),
+        ("results/x ppo_gtrxl_di.py --help", "--help trains nothing"),
+        ("results/x ppo_gtrxl_di.py --no-save-model", "--no-save-model leaves no run to publish"),
+    ],
+)
+def test_the_line_that_cannot_be_a_job_is_named(tmp_path, monkeypatch, line, says):
+    (tmp_path / "jobs.txt").write_text(f"# a comment\nresults/x ppo_gtrxl_di.py\n{line}\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["run_seeds.py", "jobs.txt"])
+    with pytest.raises(SystemExit) as stop:
+        run_seeds.main()
+    message = str(stop.value.code)
+    assert message.startswith(f"error: jobs.txt, line 3: {says}")
+    assert "\n" not in message and list(tmp_path.iterdir()) == [tmp_path / "jobs.txt"]
+
+
+@pytest.mark.parametrize("content", ['{"seed": 1', "[]", "\xff"])
+def test_a_damaged_run_of_others_is_skipped_and_named_once(tmp_path, monkeypatch, capsys, content):
+    """Newer than the run that is looked for, which is found all the same."""
+    monkeypatch.chdir(tmp_path)
+    for number, (name, text) in enumerate({"mine": json.dumps({"seed": 1}), "other": content}.items()):
+        path = tmp_path / "runs" / name / "args.json"
+        path.parent.mkdir(parents=True)
+        path.write_text(text, encoding="latin-1")
+        os.utime(path, (number, number))
+    job = run_seeds.Job(tmp_path / "results", [], {"seed": 1})
+    assert job.run_dir() == job.run_dir() == Path("runs/mine")
+    printed = capsys.readouterr().out
+    assert printed.startswith("runs/other/args.json is skipped") and printed.count("\n") == 1
+
+
+def test_a_run_is_trained_once_its_evaluation_is_whole(tmp_path, monkeypatch):
+    monkeypatch.setattr(run_seeds.Job, "run_dir", lambda job: tmp_path)
+    job = run_seeds.Job(tmp_path, [], {})
+    (tmp_path / "eval.json").touch()
+    assert not job.is_trained()
+    (tmp_path / "eval.npz").touch()
+    assert job.is_trained()
+
+
+def published_folder(tmp_path, shipped, *missing):
+    """A run of seed 1, and a results folder that has it and ships the run of seed `shipped`, but for some files."""
+    run, results = tmp_path / "run", tmp_path / "results"
+    (results / "seeds").mkdir(parents=True)
+    run.mkdir()
+    text = {seed: json.dumps({"env_id": "VanDerPol-v0", "seed": seed, "of": "this run"}) for seed in (1, 2)}
+    (run / "eval.json").write_text(text[1])
+    for name in {"seeds/1.json", "agent.safetensors", "eval.npz", "figures", "eval.json"} - {*missing}:
+        (results / name).write_text(text[shipped] if name == "eval.json" else text[1])
+    return run, results
+
+
+@pytest.mark.parametrize(
+    "shipped, missing, numbers, again",
+    [
+        (1, [], False, None),
+        (1, ["seeds/1.json"], False, True),
+        (1, ["agent.safetensors"], False, True),
+        (1, ["figures"], False, True),
+        (1, ["eval.json", "agent.safetensors", "eval.npz", "figures"], False, False),  # nothing is shipped yet
+        (1, ["agent.safetensors", "figures"], True, None),
+        (1, ["eval.json", "agent.safetensors", "eval.npz", "figures"], True, None),
+        (2, ["agent.safetensors", "figures"], False, None),  # another seed's affair
+        (2, ["seeds/1.json"], False, False),
+    ],
+)
+def test_what_is_missing_of_a_published_run_is_published(tmp_path, monkeypatch, shipped, missing, numbers, again):
+    """`again` is whether with `ship`, None if not at all."""
+    run, results = published_folder(tmp_path, shipped, *missing)
+    published = []
+    monkeypatch.setattr(run_seeds.Job, "run_dir", lambda job: run)
+    monkeypatch.setattr(evaluate, "publish", lambda *folders, **options: published.append(options["ship"]))
+    run_seeds.Job(results, [], {"seed": 1}).publish(numbers)
+    assert published == ([] if again is None else [again])
+
+
+class Trained:
+    """A job that is trained already, or by a process that ends at once, and may not be publishable."""
+
+    def __init__(self, name, trained, error=None):
+        self.command, self.trained, self.error, self.published = [name], trained, error, False
+
+    def is_trained(self):
+        return self.trained
+
+    def start(self):
+        return subprocess.Popen([sys.executable, "-c", ""])
+
+    def publish(self, numbers):
+        if self.error:
+            raise self.error
+        self.published = True
+
+
+@pytest.mark.parametrize("trained", [True, False])
+def test_what_cannot_be_published_fails_alone(capsys, trained):
+    jobs = [
+        Trained("first", trained, ValueError("results/x is of another problem")),
+        Trained("second", trained, OSError(28, "No space left on device", "results/x/eval.npz")),
+        Trained("third", trained),
+        Trained("last", False),
+    ]
+    assert run_seeds.work(jobs, 1, False) == jobs[:2]
+    assert [job.published for job in jobs] == [False, False, True, True]
+    failed = [line for line in capsys.readouterr().out.splitlines() if line.startswith("not published")]
+    assert failed == [
+        "not published: first: results/x is of another problem",
+        "not published: second: [Errno 28] No space left on device: 'results/x/eval.npz'",
+    ]
+
+
+def test_without_a_run_nothing_is_published(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match="runs/ holds no run with these arguments"):
+        run_seeds.Job(tmp_path / "results", [], {"seed": 1}).publish(False)
 
 
 @pytest.mark.parametrize("seed, replaces", [(1, True), (2, False)])

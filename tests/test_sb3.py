@@ -1,5 +1,11 @@
 """Stable-Baselines3 on these environments, in its own ways and by the native batch; skipped where it is missing."""
 
+import json
+import pickle
+import shlex
+import subprocess
+from pathlib import Path
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -15,6 +21,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormali
 
 from sb3_env import NativeVecEnv
 
+ROOT = Path(__file__).parent.parent
 IDS = ["VanDerPolWaypoints-v0", "RocketAscentCutoff-v0"]
 OPTIONS = {env_id: {"action_frame": "local"} if env_id in envs.ROCKETS else {} for env_id in IDS}
 
@@ -132,3 +139,137 @@ def test_the_benchmark_follows_our_curriculum():
 
     model.learn(64, callback=Watch(script, args, batch, 64))
     assert prices == [(pytest.approx(price), 1) for price in (0, 0, 3 * 0.25 / 0.35, 3 * (1 - 0.9 * 0.15 / 0.4))]
+
+
+class Recorder(NativeVecEnv):
+    """Keeps every observation with its environment and the step of its flight; the first copy crashes at the start."""
+
+    def reset(self):
+        self.step_of, self.seen, self.steps_taken = [0] * self.num_envs, [], 0
+        return self._keep(super().reset())
+
+    def step_wait(self):
+        if self.steps_taken < 3:
+            self.actions[0] = [-1.0, 0.0, 0.0]
+        self.steps_taken += 1
+        obs, rewards, dones, infos = super().step_wait()
+        self.step_of = [0 if done else step + 1 for done, step in zip(dones, self.step_of)]
+        return self._keep(obs), rewards, dones, infos
+
+    def _keep(self, obs):
+        self.seen.append([(k, step, obs[k].copy()) for k, step in enumerate(self.step_of)])
+        return obs
+
+
+def mean_flights(seen, rollout):
+    """The expected `mean_flight` after each rollout of so many steps, one after the other, by plain loops."""
+    from test_mean_flight import compared
+
+    rocket, mean = envs.ROCKETS["RocketAscentCutoff-v0"].rocket, np.zeros((482, 7))
+    for first in range(0, len(seen) - 1, rollout):
+        flown = {(step, k): obs for moment in seen[first : first + rollout + 1] for k, step, obs in moment}
+        for t in {step for step, _ in flown}:
+            new = np.mean(
+                [compared(obs.astype(float), rocket) for (step, _), obs in flown.items() if step == t], axis=0
+            )
+            mean[t] += (new - mean[t]) * (0.1 if mean[t].any() else 1.0)
+    return mean
+
+
+@pytest.mark.parametrize("recurrent", [False, True])
+def test_the_benchmark_learns_the_mean_of_dispersed_flights(recurrent):
+    """Over three rollouts, flights that begin in the middle of one, and a crash; it changes nothing at first."""
+    sb3_contrib = pytest.importorskip("sb3_contrib")
+    import sb3_ppo
+
+    import ppo_gtrxl_rocket as script
+
+    env_id, rollout, cleared = "RocketAscentCutoff-v0", 30, []
+    args = script.Args(env_id=env_id, dispersion=1.0)
+    recorder = Recorder(gym.make_vec(env_id, num_envs=4, action_frame="local", dispersion=1.0))
+    seen = sb3_ppo.OurFeatures(recorder, script, env_id)
+    kind, policy = (sb3_contrib.RecurrentPPO, "MlpLstmPolicy") if recurrent else (PPO, "MlpPolicy")
+    sizes = {"n_steps": rollout, "batch_size": 60, "n_epochs": 1, "device": "cpu", "seed": 0}
+    model = kind(policy, VecNormalize(seen), policy_kwargs={"log_std_init": -3.0}, **sizes)
+    model.policy.action_net.bias.data = torch.tensor(script.INITIAL_ACTION)
+
+    class Watch(sb3_ppo.OurMeanFlight):
+        def _on_rollout_end(self):
+            before = [weight[:, -7:].abs().max() for weight in sb3_ppo.input_weights(self.model.policy)]
+            super()._on_rollout_end()
+            after = [weight[:, -7:].abs().max() for weight in sb3_ppo.input_weights(self.model.policy)]
+            cleared.append((min(before) > 0, max(after) == 0, self.training_env.obs_rms.var[-7:].copy()))
+
+    model.learn(3 * 4 * rollout, callback=Watch(script, args, seen))
+    expected = mean_flights(recorder.seen, rollout)
+    assert expected.any(axis=1).sum() > 85 and recorder.step_of[0] < recorder.step_of[1]  # it did crash
+    np.testing.assert_allclose(seen.constants.mean_flight.numpy(), expected, rtol=1e-4, atol=1e-4)
+    assert [(before, zero) for before, zero, _ in cleared] == [(True, True), (False, True), (True, False)]
+    assert (cleared[0][2] == 1).all() and (cleared[2][2] > 0.1).all()  # not enlarged
+    assert np.abs(model.get_vec_normalize_env().normalize_obs(seen(seen.raw))[:, -7:]).max() > 0.01
+
+
+def test_the_benchmarks_dispersed_run(tmp_path, monkeypatch):
+    """It begins with a saved nominal run, under our price and noise, and is measured on as many draws as ours."""
+    pytest.importorskip("sb3_contrib")
+    import sb3_ppo
+
+    made, evaluated, make_model = [], [], sb3_ppo.make_model
+
+    def keep_model(options, script, args, *rest):
+        model = make_model(options, script, args, *rest)
+        made.append((args.mass_weight, args.dispersion, model.policy.log_std.detach().tolist()))
+        return model
+
+    def keep_evaluation(env_id, policy, eval_seed, n, **options):
+        evaluated.append((n, options["dispersion"]))
+        return {"env_id": env_id, "error_norm": 1.0, "mass_ratio": 0.9}, {}
+
+    monkeypatch.setattr(sb3_ppo, "make_model", keep_model)
+    monkeypatch.setattr(sb3_ppo.evaluate, "evaluate", keep_evaluation)
+    monkeypatch.setattr(sb3_ppo.evaluate, "table", str)
+    monkeypatch.chdir(tmp_path)
+    flags = "--env-id RocketAscentCutoff-v0 --num-envs 1 --batch-size 1000 --epochs 1 --samples 900".split()
+
+    def cut(*paths):
+        raise InterruptedError
+
+    def run(*more):
+        monkeypatch.setattr("sys.argv", ["sb3_ppo.py", *flags, *more])
+        sb3_ppo.main()
+
+    run("--save", "nominal.zip", "--json", "nominal.json")
+    written = json.loads((tmp_path / "nominal.json").read_text())
+    assert written["flags"] == shlex.join([*flags, "--save", "nominal.zip", "--json", "nominal.json"])
+    assert written["final"]["mass_ratio"] == 0.9 and written["curve"][-1]["samples"] >= 900
+    head = subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True).stdout
+    assert head.startswith(written["commit"] or "-") or not head  # the project may stand outside git
+    start = ["--start", "nominal.zip", "--dispersion", "1"]
+    run(*start, "--save", "dispersed.zip", "--mass-weight", "0.5", "--log-std", "-3.5")
+    with monkeypatch.context() as broken, pytest.raises(InterruptedError):
+        broken.setattr("os.replace", cut)
+        run(*start, "--json", "nominal.json")
+    assert json.loads((tmp_path / "nominal.json").read_text()) == written  # whole or untouched
+    assert made[0] == (3.0, 0.0, [pytest.approx(-1.4)] * 3) and made[1] == (0.5, 1.0, [-3.5] * 3)
+    assert made[2][:2] == (3.0, 1.0) and made[2][2] != made[0][2] and max(made[2][2]) < -1.3  # learnt
+    assert evaluated == [(1000, 0.0)] * 2 + [(1705, 1.0)] * 4  # twice in each run
+    saved = pickle.loads((tmp_path / "dispersed.pkl").read_bytes())
+    assert vars(saved)["mean_flight"][:100].any(dim=1).all()
+
+
+@pytest.mark.parametrize(
+    "flags, line",
+    [
+        ("--log-std 3", "--log-std 3.0: must be between -8.0 and 0.5"),
+        ("--mass-weight 0.5", "--mass-weight 0.5: only a rocket has it, not DoubleIntegrator-v0"),
+        ("--start nothing.zip", "--start nothing.zip: there is no nothing.zip"),
+    ],
+)
+def test_the_benchmark_refuses_in_one_line(flags, line, monkeypatch, capsys):
+    pytest.importorskip("sb3_contrib")
+    import sb3_ppo
+
+    monkeypatch.setattr("sys.argv", ["sb3_ppo.py", *flags.split()])
+    with pytest.raises(SystemExit) as stop:
+        sb3_ppo.parse_args()
+    assert stop.value.code == f"error: {line}" and capsys.readouterr().err == ""

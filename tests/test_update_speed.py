@@ -1,10 +1,12 @@
 """`benchmarks/update_speed.py`: its FLOP formula against torch's counter, its gathered windows against the scripts."""
 
+import contextlib
 import importlib
 import re
 
 import pytest
 import torch
+from matplotlib.image import imread
 
 TINY = {"num_envs": 3, "num_minibatches": 2, "num_blocks": 2, "embed_dim": 8, "num_heads": 2, "memory_length": 20}
 
@@ -46,3 +48,16 @@ def test_gathered_seconds_of_a_part_are_scaled_to_the_whole(speed, monkeypatch):
     monkeypatch.setitem(speed.GATHERED_SAMPLES, "di", 3)
     gathered = speed.measure("di", 1, 3, changes=TINY)["gathered windows"]
     assert float(re.search(r"([0-9.]+) times ours", gathered)[1]) > 3
+
+
+@pytest.mark.parametrize("full", [False, True])
+def test_the_figure_of_growth_is_whole_or_as_it_was(speed, full, tmp_path, monkeypatch, request):
+    path = tmp_path / "growth.png"
+    path.write_bytes(b"the old one")
+    monkeypatch.setattr(speed, "median_seconds", lambda call, repeats: (0.1, None))
+    request.getfixturevalue("cut_figures") if full else None
+    monkeypatch.setattr("sys.argv", ["update_speed.py", "--growth", str(path)])
+    with pytest.raises(OSError, match="No space left") if full else contextlib.nullcontext():
+        speed.main()
+    assert len(list(tmp_path.iterdir())) == 1
+    assert path.read_bytes() == b"the old one" if full else imread(path).std() > 0.05
