@@ -170,7 +170,8 @@ class PhasedVectorEnv(BatchedEnv):
     starts.
 
     Attributes that only training changes, to be set before a `reset`: `radius_scale`, a scalar or one number a phase,
-    enlarges the radii in which the *reward* pays the bonus (1 is the paper); and `flights_per_start` (`BatchedEnv`).
+    enlarges the radii in which the *reward* pays the bonus (1 is the paper); `bonus_width`, the distance beyond them
+    over which that bonus falls to 0 linearly (0, a step, is the paper); and `flights_per_start` (`BatchedEnv`).
     """
 
     metadata = {**BatchedEnv.metadata, **DRAWN}
@@ -184,7 +185,7 @@ class PhasedVectorEnv(BatchedEnv):
         render_mode: str | None = None,
     ):
         self.problem, self.observe_phase, self.observe_velocity = problem, observe_phase, observe_velocity
-        self.radius_scale = 1.0
+        self.radius_scale, self.bonus_width = 1.0, 0.0
         multi_phase = len(problem.phases) > 1
         target_max = np.max([np.abs(phase.target) for phase in problem.phases], axis=0)
         target_max[target_max == 0] = 1.0  # of velocity, where all waypoints are at rest: a box must have a width
@@ -259,8 +260,11 @@ class PhasedVectorEnv(BatchedEnv):
         self._terminal_error[ending, k] = error
         self._terminal_cost[ending] += Qf * error**2
         self._bonus[ending] += B * (error <= radius)
+        share = error <= scale * radius
+        if self.bonus_width:
+            share = np.clip(1 - (error - scale * radius) / self.bonus_width, 0, 1)
         rewards = np.zeros(self.num_envs)
-        rewards[ending] = -Qf * error**2 + B * (error <= scale * radius)
+        rewards[ending] = -Qf * error**2 + B * share
         return rewards
 
     def _final_info(self):
@@ -282,6 +286,7 @@ class PhasedEnv(SingleEnv):
     """One `PhasedVectorEnv`."""
 
     radius_scale = of_batch("radius_scale", "Factor on the radii in which the reward pays the bonus (1: the paper).")
+    bonus_width = of_batch("bonus_width", "Distance beyond them over which the bonus falls to 0 (0: the paper).")
 
 
 def make_phased_vector(env_id: str, num_envs: int = 1, **options) -> PhasedVectorEnv:

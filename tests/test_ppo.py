@@ -116,13 +116,15 @@ def test_linear_schedule():
     assert script.linear_schedule(1.0, 0.0, 0.5) == pytest.approx(0.5)
 
 
-@pytest.mark.parametrize("refines", [False, True])
-@pytest.mark.parametrize("progress, scale", [(0.0, 12.0), (0.25, 12**0.5), (0.5, 1.0), (0.6, 1.0), (1.0, 1.0)])
-def test_radius_curriculum(progress, scale, refines):
-    """From K to 1 until half of the updates, geometrically: half-way in 12^(1/2); a tenth smaller if refined."""
+@pytest.mark.parametrize("refine_from", [None, 0.3])
+@pytest.mark.parametrize("progress, scale", [(0.0, 12.0), (0.5, 12**0.5), (1.0, 1.0), (1.1, 1.0), (1.6, 1.0)])
+def test_radius_curriculum(refine_from, progress, scale):
+    """From K to 1 until the refinement, or 60 % of the updates, geometrically: half-way in 12^(1/2); 0.9 if refined."""
     envs = gym.make_vec("DoubleIntegratorWaypoints-v0", num_envs=1)
-    script.set_curriculum(envs, script.Args(), progress, refines, std=1.0)
-    assert envs.radius_scale == pytest.approx(0.9 * scale if refines else scale)
+    until = refine_from or 0.6
+    refines = refine_from is not None and progress >= 1
+    script.set_curriculum(envs, script.Args(refine_from=refine_from), progress * until, refines, std=1.0)
+    assert envs.radius_scale == pytest.approx(0.9 if refines else scale)
 
 
 @pytest.fixture
