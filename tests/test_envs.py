@@ -177,11 +177,35 @@ def test_radius_scale_changes_only_the_reward(env_id):
             np.testing.assert_array_equal(value, finals[0][key])
 
 
-def test_radius_scale_of_the_single_environment():
+@pytest.mark.parametrize("env_id", IDS)
+def test_bonus_falls_to_nothing_over_its_width(env_id):
+    """From the whole bonus on the circle to none a width beyond it, in proportion; what is reported stays."""
+    actions, sums, finals = random_actions(env_id, 3), [], []
+    for width in (0.0, 1e-9, 20.0, 1e9):
+        envs = gym.make_vec(env_id, num_envs=3)
+        envs.unwrapped.bonus_width = width
+        envs.reset(options={"x0": CORNERS[:3]})
+        steps = [envs.step(action) for action in actions]
+        sums.append(sum(step[1] for step in steps))
+        finals.append(steps[-1][4]["final_info"])
+    radii, bonuses = np.array([[phase[2], phase[5]] for phase in PAPER[env_id][1]]).T
+    beyond = finals[0]["terminal_error"] - radii
+    assert (beyond > 0).all() and (beyond < 20).any()
+    np.testing.assert_allclose(sums[1], sums[0])
+    np.testing.assert_allclose(sums[2] - sums[0], (bonuses * np.maximum(1 - beyond / 20, 0)).sum(axis=1), atol=1e-9)
+    np.testing.assert_allclose(sums[3] - sums[0], bonuses.sum(), rtol=1e-6)
+    for final in finals[1:]:
+        for key, value in final.items():
+            np.testing.assert_array_equal(value, finals[0][key])
+
+
+@pytest.mark.parametrize("name, value", [("radius_scale", 1e4), ("bonus_width", 1e9)])
+def test_the_single_environment_has_the_curriculum_s_attributes(name, value):
     returns = []
-    for scale in (1.0, 1e4):
+    for changed in (False, True):
         env = gym.make("VanDerPol-v0")
-        env.unwrapped.radius_scale = scale
+        if changed:
+            setattr(env.unwrapped, name, value)
         env.reset(options={"x0": [1.0, 1.0]})
         returns.append(sum(env.step([1.5])[1] for _ in range(70)))
     assert returns[1] - returns[0] == pytest.approx(20.0)

@@ -125,6 +125,7 @@ def test_radius_curriculum(refine_from, progress, scale):
     refines = refine_from is not None and progress >= 1
     script.set_curriculum(envs, script.Args(refine_from=refine_from), progress * until, refines, std=1.0)
     assert envs.radius_scale == pytest.approx(0.9 if refines else scale)
+    assert envs.bonus_width == (0.4 if refines else 0.0)
 
 
 @pytest.fixture
