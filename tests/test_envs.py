@@ -157,46 +157,45 @@ def test_fly_records_states_and_applied_controls(env_id):
     assert flight["x"].shape == (4, horizon(env_id) + 1, 2)
 
 
-@pytest.mark.parametrize("env_id", IDS)
-def test_radius_scale_changes_only_the_reward(env_id):
-    actions, bonuses = random_actions(env_id, 3), [phase[5] for phase in PAPER[env_id][1]]
-    last_only = [1.0] * (len(bonuses) - 1) + [1e4]
-    sums, finals = [], []
-    for scale in (1.0, 1e4, last_only):
+def returns_with(env_id, name, values):
+    """Sums of rewards (3,) of the same flights with each value of an attribute, and the `final_info` of the first.
+
+    What is reported must be the same to the bit with all of them.
+    """
+    actions, sums, finals = random_actions(env_id, 3), [], []
+    for value in values:
         envs = gym.make_vec(env_id, num_envs=3)
-        envs.unwrapped.radius_scale = scale
+        setattr(envs.unwrapped, name, value)
         envs.reset(options={"x0": CORNERS[:3]})
         steps = [envs.step(action) for action in actions]
         sums.append(sum(step[1] for step in steps))
         finals.append(steps[-1][4]["final_info"])
-    assert not finals[0]["hit"].any()
+    for final in finals[1:]:
+        for key, reported in final.items():
+            np.testing.assert_array_equal(reported, finals[0][key])
+    return sums, finals[0]
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_radius_scale_changes_only_the_reward(env_id):
+    bonuses = [phase[5] for phase in PAPER[env_id][1]]
+    last_only = [1.0] * (len(bonuses) - 1) + [1e4]
+    sums, final = returns_with(env_id, "radius_scale", (1.0, 1e4, last_only))
+    assert not final["hit"].any()
     np.testing.assert_allclose(sums[1] - sums[0], sum(bonuses))
     np.testing.assert_allclose(sums[2] - sums[0], bonuses[-1])
-    for final in finals[1:]:
-        for key, value in final.items():
-            np.testing.assert_array_equal(value, finals[0][key])
 
 
 @pytest.mark.parametrize("env_id", IDS)
 def test_bonus_falls_to_nothing_over_its_width(env_id):
     """From the whole bonus on the circle to none a width beyond it, in proportion; what is reported stays."""
-    actions, sums, finals = random_actions(env_id, 3), [], []
-    for width in (0.0, 1e-9, 20.0, 1e9):
-        envs = gym.make_vec(env_id, num_envs=3)
-        envs.unwrapped.bonus_width = width
-        envs.reset(options={"x0": CORNERS[:3]})
-        steps = [envs.step(action) for action in actions]
-        sums.append(sum(step[1] for step in steps))
-        finals.append(steps[-1][4]["final_info"])
+    sums, final = returns_with(env_id, "bonus_width", (0.0, 1e-9, 20.0, 1e9))
     radii, bonuses = np.array([[phase[2], phase[5]] for phase in PAPER[env_id][1]]).T
-    beyond = finals[0]["terminal_error"] - radii
+    beyond = final["terminal_error"] - radii
     assert (beyond > 0).all() and (beyond < 20).any()
     np.testing.assert_allclose(sums[1], sums[0])
     np.testing.assert_allclose(sums[2] - sums[0], (bonuses * np.maximum(1 - beyond / 20, 0)).sum(axis=1), atol=1e-9)
     np.testing.assert_allclose(sums[3] - sums[0], bonuses.sum(), rtol=1e-6)
-    for final in finals[1:]:
-        for key, value in final.items():
-            np.testing.assert_array_equal(value, finals[0][key])
 
 
 @pytest.mark.parametrize("name, value", [("radius_scale", 1e4), ("bonus_width", 1e9)])

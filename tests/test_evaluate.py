@@ -539,6 +539,12 @@ def test_publish_ships_the_first_seed_and_adds_the_second(tmp_path, monkeypatch,
     assert snapshot(results)[Path("figures/training.png")] != files[Path("figures/training.png")]
     assert (results / "agent.safetensors").read_bytes() == b"weights of seed 1"
 
+
+def test_shipping_another_seed_replaces_all_or_nothing(tmp_path, monkeypatch, capsys):
+    first, second = make_run(tmp_path / "a", seed=1), make_run(tmp_path / "b", seed=2)
+    results = tmp_path / "results" / "di"
+    monkeypatch.setattr(animation, "FRAMES", 3)
+    command_line(monkeypatch, capsys, "publish", first, results)
     before = snapshot(results)
     monkeypatch.setattr(evaluate, "animate", full_disk)
     with pytest.raises(SystemExit, match="No space left"):
