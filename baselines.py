@@ -269,28 +269,32 @@ def guesses(env_id: str, x0):
 
 
 def _solve_start(task):
-    """Solve one start: `(u (T,), cost, feasible)`. A task holds all it needs, so that any process can take it."""
+    """Solve one start, as `optimise` returns it. A task holds all it needs, so that any process can take it."""
     env_id, defect, in_circles, index, x0 = task
     solve, arguments = solver(env_id, defect, in_circles)
+    T = PROBLEMS[env_id].steps
     solutions, statuses = [], []
     for guess in guesses(env_id, x0):
         solution = solve(p=x0, x0=guess, **arguments)
         statuses.append(solve.stats()["return_status"])
-        solutions.append((solution["x"].full()[: PROBLEMS[env_id].steps, 0], float(solution["f"])))
+        multipliers = solution["lam_g"].full()[2 * T :, 0]
+        solutions.append((solution["x"].full()[:T, 0], float(solution["f"]), multipliers))
     solved = [k for k, status in enumerate(statuses) if status == "Solve_Succeeded"]
     # only the circles can be out of reach: without them every control has its trajectory
     if not solved and not (in_circles and "Infeasible_Problem_Detected" in statuses):
         stopped = ", ".join(dict.fromkeys(statuses))
         raise NoOptimum(f"start {index}, x0 = {x0.tolist()}, of {env_id}: IPOPT stopped with {stopped}")
     best = min(solved, key=lambda k: solutions[k][1], default=0)
-    return *solutions[best], bool(solved)
+    u, cost, multipliers = solutions[best]
+    return u, cost, bool(solved), multipliers
 
 
 def optimise(env_id: str, x0, defect: Callable = shooting, in_circles: bool = False, processes: int | None = None):
-    """Solve `program` from each start x0 (n, 2): controls u (n, T), costs (n,) and whether a solution exists (n,).
+    """Solve `program` from each start x0 (n, 2): controls u (n, T), costs (n,), whether a solution exists (n,), and the
+    multipliers of |dx|^2 / r^2 <= 1 (n, phases), or (n, 0) without `in_circles`.
 
     Of several `guesses` the best solution counts; one that fails is no error where another does not. Where no solution
-    exists (`in_circles` only) u and cost are IPOPT's last ones and mean nothing. Any other failure is a RuntimeError
+    exists (`in_circles` only) the rest are IPOPT's last ones and mean nothing. Any other failure is a RuntimeError
     that names the start. `processes` (default: by the number of starts and cores) changes only the time; they are
     spawned, which is safe beside the threads of other libraries.
     """
@@ -303,8 +307,8 @@ def optimise(env_id: str, x0, defect: Callable = shooting, in_circles: bool = Fa
         chunk = -(-len(tasks) // (4 * processes))
         with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
             solutions = list(pool.map(_solve_start, tasks, chunksize=chunk))
-    u, cost, feasible = zip(*solutions)
-    return np.array(u), np.array(cost), np.array(feasible)
+    u, cost, feasible, multipliers = zip(*solutions)
+    return np.array(u), np.array(cost), np.array(feasible), np.array(multipliers)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -347,7 +351,7 @@ def reference(env_id: str, x0, processes: int | None = None) -> dict:
     if env_id == DOUBLE_INTEGRATOR.env_id:
         return fly(env_id, lqr_policy(DOUBLE_INTEGRATOR), x0)
     if len(PROBLEMS[env_id].phases) == 1:
-        u, cost, _ = optimise(env_id, x0, processes=processes)
+        u, cost, _, _ = optimise(env_id, x0, processes=processes)
         return replay(env_id, x0, u, cost)
     return waypoint_reference(env_id, x0, processes)
 
@@ -356,11 +360,13 @@ def waypoint_reference(env_id: str, x0, processes: int | None = None) -> dict:
     """The better, bonuses counted, of the optima with and without |x - target| <= r at every phase's end.
 
     Beside `replay`'s arrays: `constrained` (n,), whether it is the one with the circles; `infeasible` (n,), whether no
-    control reaches all circles (then it is the one without); and `cost_free` (n,), `terminal_error_free` (n, phases)
-    of the optimum without. Raises RuntimeError where an optimum with the circles misses one in flight.
+    control reaches all circles (then it is the one without); `cost_free` (n,), `terminal_error_free` (n, phases) of the
+    optimum without; and `circle_price` (n, phases), what a unit of radius would save the one with the circles: from
+    their multipliers, 0 where it ends inside, NaN where infeasible. Raises RuntimeError where an optimum with the
+    circles misses one in flight.
     """
-    u_free, cost_free, _ = optimise(env_id, x0, processes=processes)
-    u, cost, feasible = optimise(env_id, x0, in_circles=True, processes=processes)
+    u_free, cost_free, _, _ = optimise(env_id, x0, processes=processes)
+    u, cost, feasible, multipliers = optimise(env_id, x0, in_circles=True, processes=processes)
     free = replay(env_id, x0, u_free, cost_free)
     circled = replay(env_id, x0, np.where(feasible[:, None], u, u_free), np.where(feasible, cost, cost_free))
     missed = feasible & ~circled["hit"].all(axis=1)
@@ -372,7 +378,9 @@ def waypoint_reference(env_id: str, x0, processes: int | None = None) -> dict:
     best = {key: free[key].copy() for key in free}
     for key, values in best.items():
         values[constrained] = circled[key][constrained]
-    compared = {"cost_free": free["cost"], "terminal_error_free": free["terminal_error"]}
+    radius = np.array([phase.radius for phase in PROBLEMS[env_id].phases])
+    price = np.where(feasible[:, None], multipliers * 2 / radius, np.nan)  # the derivative of |dx|^2 / r^2 is 2 / r
+    compared = {"cost_free": free["cost"], "terminal_error_free": free["terminal_error"], "circle_price": price}
     return {**best, "constrained": constrained, "infeasible": ~feasible, **compared}
 
 
@@ -410,7 +418,7 @@ def compare_double_integrator(env_id: str, x0, flight: dict) -> dict:
 
 def compare_single_phase(env_id: str, x0, flight: dict) -> dict:
     """The paper's other references: direct collocation (as solved, and flown) and LQR about the target."""
-    u, cost, _ = optimise(env_id, x0, hermite_simpson)
+    u, cost, _, _ = optimise(env_id, x0, hermite_simpson)
     collocated = fly(env_id, lambda obs, t: u[:, t, None], x0)["cost"]
     linear = fly(env_id, lqr_policy(PROBLEMS[env_id]), x0)["cost"]
     numbers = {}
@@ -431,6 +439,9 @@ def compare_waypoints(env_id: str, x0, flight: dict) -> dict:
     numbers["bonus_won_mean"] = ((flight["hit"].astype(int) - hit_free) @ bonus).mean()
     for name, key in (("distance_free", "terminal_error_free"), ("distance", "terminal_error")):
         numbers |= {f"{name}_phase_{k}": mean for k, mean in enumerate(flight[key].mean(axis=0), start=1)}
+    price = flight["circle_price"][~flight["infeasible"]]
+    if len(price):
+        numbers |= {f"circle_price_phase_{k}": mean for k, mean in enumerate(price.mean(axis=0), start=1)}
     return numbers
 
 

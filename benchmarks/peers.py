@@ -1,7 +1,7 @@
 """Stable-Baselines3 beside our results: trains what is missing in results/peers, then prints the table.
 
     pip install -r benchmarks/requirements.txt
-    python benchmarks/peers.py --at-once 2    # hours
+    python benchmarks/peers.py --at-once 2    # hours; --rows di cutoff: these alone
     python benchmarks/peers.py --table        # of what is there
 
 Each row is one way of learning, seeds 1 to 3, by `benchmarks/sb3_ppo.py` with the settings that were best for it in
@@ -51,7 +51,6 @@ PEERS = {
     "lstm": Peer("LSTM, cut-off", LSTM, ROCKET_KEYS, (1,)),
     "di": Peer("double integrator, our samples", "--samples 2560000", DI_KEYS),
     "cutoff": Peer("cut-off, our features, our samples", f"{CUTOFF} --samples 7450000", ROCKET_KEYS),
-    "cutoff_longer": Peer("cut-off, our features, our minutes", f"{CUTOFF} --samples 11000000", ROCKET_KEYS),
     "cutoff_raw": Peer("cut-off, raw, our samples", f"{CUTOFF} --samples 7450000 --features raw", ROCKET_KEYS),
     "lstm_dispersed": Peer(
         "LSTM, from there, dispersed",
@@ -96,15 +95,18 @@ def train(name, seed, before=None):
     return f"{name}, seed {seed}: ended with {ended.returncode}, see {log}" if ended.returncode else None
 
 
-def train_all(at_once):
-    """Every run that is missing, `at_once` at a time, each after the one that it begins with; why some failed."""
+def train_all(at_once, rows=None):
+    """Every run of `rows` (None: all) that is missing, `at_once` at a time, each after the one that it begins with.
+
+    Returns why some failed.
+    """
     FOLDER.mkdir(parents=True, exist_ok=True)
     Path("runs").mkdir(exist_ok=True)
     futures = {}
     with ThreadPoolExecutor(at_once) as pool:
-        for name, peer in PEERS.items():
-            for seed in peer.seeds:
-                futures[name, seed] = pool.submit(train, name, seed, futures[peer.start, seed] if peer.start else None)
+        for name in rows or PEERS:
+            for seed in PEERS[name].seeds:
+                futures[name, seed] = pool.submit(train, name, seed, futures.get((PEERS[name].start, seed)))
     return [future.result() for future in futures.values() if future.result()]
 
 
@@ -137,10 +139,11 @@ def table():
 def main():
     parser = OneLineParser(description=__doc__.splitlines()[0])
     parser.add_argument("--at-once", type=integer(1, 64), default=1)
+    parser.add_argument("--rows", nargs="+", choices=PEERS, help="train these alone, in this order")
     parser.add_argument("--table", action="store_true", help="train nothing")
     options = parser.parse_args()
     try:
-        failed = [] if options.table else train_all(options.at_once)
+        failed = [] if options.table else train_all(options.at_once, options.rows)
         for line in table():
             print(f"{line[0]:36}" + "  ".join(f"{word:24}" for word in line[1:]).rstrip())
     except (OSError, ValueError) as error:

@@ -90,7 +90,7 @@ def test_ipopt_is_lqr_where_it_does_not_saturate():
     expected = reference("DoubleIntegrator-v0", x0)
     inside = np.abs(expected["u"]).max(axis=1) < 3.9
     assert 40 < inside.sum() < 60
-    u, cost, feasible = optimise("DoubleIntegrator-v0", x0[inside])
+    u, cost, feasible, _ = optimise("DoubleIntegrator-v0", x0[inside])
     assert feasible.all()
     np.testing.assert_allclose(cost, expected["cost"][inside], rtol=1e-9)
     np.testing.assert_allclose(u, expected["u"][inside], rtol=0, atol=1e-6)
@@ -118,7 +118,7 @@ def test_van_der_pol_optimum_cannot_be_improved_by_small_changes():
 def test_collocation_and_linear_feedback_beside_the_optimum():
     x0 = starts(50)
     optimum = reference("VanDerPol-v0", x0)["cost"]
-    u, cost, feasible = optimise("VanDerPol-v0", x0, hermite_simpson)
+    u, cost, feasible, _ = optimise("VanDerPol-v0", x0, hermite_simpson)
     assert feasible.all()
     np.testing.assert_allclose(cost, optimum, rtol=1e-5)
     assert not np.array_equal(cost, optimum), "collocation should be another discretisation"
@@ -195,6 +195,18 @@ def test_optimum_ends_on_the_edge_of_its_last_circle(env_id):
     np.testing.assert_allclose(optimum["terminal_error"][:, -1], radius, rtol=1e-8)
 
 
+@pytest.mark.parametrize("env_id, phase", [(env_id, phase) for env_id in WAYPOINTS for phase in (0, -1)])
+def test_circle_price_is_what_a_wider_circle_saves(new_problem, env_id, phase):
+    problem, change, cost, x0 = PROBLEMS[env_id], 1e-4, {}, starts(3)
+    for sign in (-1, 1):
+        phases = list(problem.phases)
+        phases[phase] = replace(phases[phase], radius=phases[phase].radius + sign * change)
+        like = replace(problem, env_id=f"Circle{abs(phase)}{sign}-{env_id}", phases=tuple(phases))
+        cost[sign] = reference(new_problem(like), x0)["cost"]
+    price = reference(env_id, x0)["circle_price"][:, phase]
+    np.testing.assert_allclose(price, (cost[-1] - cost[1]) / (2 * change), rtol=1e-3, atol=1e-3)
+
+
 # --- problems of a user's own -----------------------------------------------------------------------------------------
 
 
@@ -230,7 +242,7 @@ def test_guess_that_fails_is_no_error(new_problem):
     x0 = np.random.default_rng(1).uniform(-1, 1, (1, 2)) * (np.pi, 1)
     with pytest.raises(RuntimeError, match="start 0, .* of Fails-v0: IPOPT stopped with"):
         optimise(new_problem(swing_up("Fails-v0", 20, single_optimum=True)), x0)
-    u, cost, feasible = optimise(new_problem(swing_up("FailsNot-v0", 20)), x0)
+    u, cost, feasible, _ = optimise(new_problem(swing_up("FailsNot-v0", 20)), x0)
     assert feasible.all() and replay("FailsNot-v0", x0, u, cost)["replay_error"].max() < 1e-8
 
 
@@ -261,8 +273,8 @@ def test_single_optimum_is_a_promise_that_is_kept(new_problem, built_in, in_circ
     env_id = new_problem(replace(PROBLEMS[built_in], env_id=f"Again-{in_circles}-{built_in}", single_optimum=False))
     assert len(list(baselines.guesses(built_in, np.ones(2)))) == 1 < len(list(baselines.guesses(env_id, np.ones(2))))
     x0 = np.vstack([starts(2), [[1.0, 1.0]]])
-    _, one, feasible = optimise(built_in, x0, in_circles=in_circles)
-    _, several, _ = optimise(env_id, x0, in_circles=in_circles)
+    _, one, feasible, _ = optimise(built_in, x0, in_circles=in_circles)
+    _, several, _, _ = optimise(env_id, x0, in_circles=in_circles)
     assert feasible.all()
     np.testing.assert_allclose(several, one, rtol=1e-9)
 
@@ -340,7 +352,7 @@ def test_solver_failure_names_the_start():
 
 def test_replay_refuses_a_cost_that_is_not_flown():
     x0 = starts(4)
-    u, cost, _ = optimise("VanDerPol-v0", x0)
+    u, cost, _, _ = optimise("VanDerPol-v0", x0)
     assert replay("VanDerPol-v0", x0, u, cost * (1 + 1e-10))["replay_error"].max() < 1e-8
     wrong = cost.copy()
     wrong[2] *= 1 + 1e-7

@@ -87,6 +87,17 @@ def test_a_row_waits_for_the_one_that_it_begins_with(folder, commands, monkeypat
         assert started.index(first) < started.index(second)
 
 
+def test_rows_trains_these_alone(folder, commands, monkeypatch):
+    """A row that begins with another needs that one's policy, which may be of an earlier call."""
+    started, _ = commands
+    two_rows(monkeypatch)
+    for rows in (["first"], ["second"]):
+        monkeypatch.setattr(sys, "argv", ["peers.py", "--rows", *rows])
+        peers.main()
+    order = [f"runs/peer_{name}_{seed}.zip" for name in ("first", "second") for seed in (1, 2)]
+    assert [line.removeprefix("begin ") for line in started if line.startswith("begin")] == order
+
+
 def test_failed_runs_are_named_and_exit_with_1(folder, commands, monkeypatch, capsys):
     """Also those that had nothing to begin with; the others are trained."""
     started, failing = commands
