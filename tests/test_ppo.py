@@ -4,6 +4,7 @@ The scripts' shared sections are the same to the letter (test_scripts.py), so on
 """
 
 import copy
+import importlib
 import math
 
 import gymnasium as gym
@@ -116,15 +117,19 @@ def test_linear_schedule():
     assert script.linear_schedule(1.0, 0.0, 0.5) == pytest.approx(0.5)
 
 
+@pytest.mark.parametrize("name, env_id, first", [
+    ("ppo_gtrxl_di", "DoubleIntegratorWaypoints-v0", 12.0),
+    ("ppo_gtrxl_vdp", "VanDerPolWaypoints-v0", 6.0),
+])  # fmt: skip
 @pytest.mark.parametrize("refine_from", [None, 0.3])
-@pytest.mark.parametrize("progress, scale", [(0.0, 12.0), (0.5, 12**0.5), (1.0, 1.0), (1.1, 1.0), (1.6, 1.0)])
-def test_radius_curriculum(refine_from, progress, scale):
-    """From K to 1 until the refinement, or 60 % of the updates, geometrically: half-way in 12^(1/2); 0.9 if refined."""
-    envs = gym.make_vec("DoubleIntegratorWaypoints-v0", num_envs=1)
+@pytest.mark.parametrize("progress, power", [(0.0, 1), (0.5, 0.5), (1.0, 0), (1.1, 0), (1.6, 0)])
+def test_radius_curriculum(name, env_id, first, refine_from, progress, power):
+    """From K to 1 until the refinement, or 60 % of the updates, geometrically: half-way in K^(1/2); 0.9 if refined."""
+    script, envs = importlib.import_module(name), gym.make_vec(env_id, num_envs=1)
     until = refine_from or 0.6
     refines = refine_from is not None and progress >= 1
     script.set_curriculum(envs, script.Args(refine_from=refine_from), progress * until, refines, std=1.0)
-    assert envs.radius_scale == pytest.approx(0.9 if refines else scale)
+    assert envs.radius_scale == pytest.approx(0.9 if refines else first**power)
     assert envs.bonus_width == (0.4 if refines else 0.0)
 
 
