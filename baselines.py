@@ -379,7 +379,7 @@ def waypoint_reference(env_id: str, x0, processes: int | None = None) -> dict:
     for key, values in best.items():
         values[constrained] = circled[key][constrained]
     radius = np.array([phase.radius for phase in PROBLEMS[env_id].phases])
-    price = np.where(feasible[:, None], multipliers * 2 / radius, np.nan)  # the derivative of |dx|^2 / r^2 is 2 / r
+    price = np.where(feasible[:, None], multipliers * 2 / radius, np.nan)  # on the edge d(|dx|^2 / r^2) / dr = -2 / r
     compared = {"cost_free": free["cost"], "terminal_error_free": free["terminal_error"], "circle_price": price}
     return {**best, "constrained": constrained, "infeasible": ~feasible, **compared}
 

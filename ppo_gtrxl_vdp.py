@@ -118,8 +118,8 @@ def set_curriculum(envs, args, progress, refines, std):
 
     Many starts at first, in the refinement each one several times. The waypoints' radius is --radius-curriculum times
     the true one at first and shrinks geometrically to it until the refinement, or 60 % of the updates. Refined flights
-    aim at a circle a tenth smaller, because the optimum lies on its edge. A miss then costs 62 a unit of distance (25
-    over 0.4) to 100: more than it saves (`circle_price` of baselines.py: 7), but not so much that it hides the cost.
+    aim at circles a tenth smaller, because the optimum lies on the last one's edge. A miss then costs 62 to 100 a unit
+    (25 to 40 over 0.4): more than it saves (`circle_price` of baselines.py: 7), but not so much that it hides the cost.
     """
     envs.flights_per_start = args.flights_per_start if refines else 1
     shrinks_until = 0.6 if args.refine_from is None else args.refine_from

@@ -106,7 +106,7 @@ def train_all(at_once, rows=None):
     Path("runs").mkdir(exist_ok=True)
     futures = {}
     with ThreadPoolExecutor(at_once) as pool:
-        for name in rows or PEERS:
+        for name in (name for name in PEERS if rows is None or name in rows):
             for seed in PEERS[name].seeds:
                 futures[name, seed] = pool.submit(train, name, seed, futures.get((PEERS[name].start, seed)))
     return [future.result() for future in futures.values() if future.result()]
@@ -141,7 +141,7 @@ def table():
 def main():
     parser = OneLineParser(description=__doc__.splitlines()[0])
     parser.add_argument("--at-once", type=integer(1, 64), default=1)
-    parser.add_argument("--rows", nargs="+", choices=PEERS, help="train these alone, in this order")
+    parser.add_argument("--rows", nargs="+", choices=PEERS, help="train these alone")
     parser.add_argument("--table", action="store_true", help="train nothing")
     options = parser.parse_args()
     try:

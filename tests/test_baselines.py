@@ -183,6 +183,7 @@ def test_unreachable_circle_falls_back_to_the_free_optimum(env_id, near, far):
     optimum = reference(env_id, [near, far])
     assert optimum["constrained"].tolist() == [True, False] and optimum["infeasible"].tolist() == [False, True]
     assert optimum["hit"][0].all() and not optimum["hit"][1, 0]
+    assert (optimum["circle_price"][0] > 0).any() and np.isnan(optimum["circle_price"][1]).all()
     assert optimum["cost"][0] > optimum["cost_free"][0] and optimum["cost"][1] == optimum["cost_free"][1]
 
 
@@ -195,7 +196,11 @@ def test_optimum_ends_on_the_edge_of_its_last_circle(env_id):
     np.testing.assert_allclose(optimum["terminal_error"][:, -1], radius, rtol=1e-8)
 
 
-@pytest.mark.parametrize("env_id, phase", [(env_id, phase) for env_id in WAYPOINTS for phase in (0, -1)])
+@pytest.mark.parametrize("env_id, phase", [
+    ("DoubleIntegratorWaypoints-v0", 0),
+    ("DoubleIntegratorWaypoints-v0", -1),
+    ("VanDerPolWaypoints-v0", -1),
+])  # fmt: skip
 def test_circle_price_is_what_a_wider_circle_saves(new_problem, env_id, phase):
     problem, change, cost, x0 = PROBLEMS[env_id], 1e-4, {}, starts(3)
     for sign in (-1, 1):
@@ -400,7 +405,7 @@ def run(folder, *arguments):
     ("double-integrator", "DoubleIntegrator-v0", "K0_1"),
     ("van-der-pol", "VanDerPol-v0", "collocation_ratio_of_sums"),
     ("double-integrator-waypoints", "DoubleIntegratorWaypoints-v0", "cost_free_mean"),
-    ("van-der-pol-waypoints", "VanDerPolWaypoints-v0", "distance_phase_3"),
+    ("van-der-pol-waypoints", "VanDerPolWaypoints-v0", "circle_price_phase_3"),
 ])  # fmt: skip
 def test_command_writes_what_it_prints(tmp_path, name, env_id, key):
     ended = run(tmp_path, name, "--starts", "5", "--seed", "7", "--json", "a.json", "--npz", "a.npz")
