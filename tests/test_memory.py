@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import re
 import shlex
 import sys
 from pathlib import Path
@@ -171,13 +172,14 @@ def test_an_empty_folder_is_one_line(tmp_path, monkeypatch):
 
 
 def nominal_flags():
-    """By the checkpoint that a line of memory_nominal_jobs.txt makes: what it decides in a run that begins with it."""
+    """By the start of a run with a policy of memory_nominal_jobs.txt, of the same seed: what that policy decides."""
     found = {}
     for line in (ROOT / "benchmarks" / "memory_nominal_jobs.txt").read_text().splitlines():
         if not line.startswith("#"):
-            folder, flags = line.split("  ppo_gtrxl_rocket.py --seed 1 ")
+            folder, flags = line.split("  ppo_gtrxl_rocket.py ")
             flags = flags.replace("--total-updates 300 ", "").replace(" --num-threads 1", "")
-            found[f"{folder}/agent.safetensors"] = flags
+            seed, decided = re.fullmatch(r"--seed (\d) (.*)", flags).groups()
+            found[f"--seed {seed} --checkpoint {folder}/agent.safetensors"] = f"--seed {seed} {decided}"
     return found
 
 
@@ -185,10 +187,10 @@ def test_every_row_of_the_tables_has_its_three_jobs(tmp_path):
     """Seeds 1 to 3 of each, by one command that differs from its neighbours by what the row says alone."""
     lists = ("memory_di_jobs.txt", "memory_rocket_jobs.txt", "result_jobs.txt")
     text, nominal = "\n".join((ROOT / "benchmarks" / name).read_text() for name in lists), nominal_flags()
-    assert len(nominal) == len(memory.EXPERIMENTS["rocket"].rows)
-    for checkpoint, flags in nominal.items():
-        assert text.count(checkpoint) == 3
-        text = text.replace(f"--checkpoint {checkpoint}", flags)
+    assert len(nominal) == 3 * len(memory.EXPERIMENTS["rocket"].rows)
+    for start, flags in nominal.items():
+        assert text.count(start) == 1
+        text = text.replace(start, flags)
     (tmp_path / "jobs.txt").write_text(text)
     jobs = run_seeds.read_jobs(tmp_path / "jobs.txt")
     found = []
