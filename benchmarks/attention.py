@@ -5,8 +5,9 @@
 
 Flies the mean action once (a rocket trained on dispersions: the first draw of `--eval-seed`, else the first start),
 draws a panel for each head, and prints how far back each looks: the mean distance under its weights, over the whole
-flight, in the 20 s after each staging (or the 1 s after each waypoint), and what uniform weights would give. Then the
-gates: lambda's mean, the share of a block's input that passes each by, and what it was before training.
+flight, in the 20 s after each staging (or the 1 s after each waypoint), and what uniform weights would give; and its
+largest weight on an earlier step. Then the gates: lambda's mean, the share of a block's input that passes each by, and
+what it was before training.
 """
 
 from __future__ import annotations
@@ -126,7 +127,10 @@ def draw(found, t, events, title):
 
 
 def lines(found, t, events):
-    """The printed table: each head's mean distance (s) under its weights, of all steps and of those after an event."""
+    """The printed table: each head's mean distance (s) under its weights, of all steps and of those after an event.
+
+    And its largest weight on a step of the flight other than the one that asks.
+    """
     dt, window = t[1] - t[0], found.shape[-1]
     after = np.zeros(len(t), dtype=bool)
     for event in events:
@@ -136,10 +140,19 @@ def lines(found, t, events):
     for b, h in np.ndindex(found.shape[:2]):
         late = f", in the {10 * dt:g} s after an event {back[b, h, after].mean():.2f}" if after.any() else ""
         own = found[b, h, :, 0].mean()
-        rows.append(
-            f"  block {b + 1}, head {h + 1}: {back[b, h].mean():.2f}{late}; weight on the step itself {own:.2f}"
-        )
+        row = f"  block {b + 1}, head {h + 1}: {back[b, h].mean():.2f}{late}; weight on the step itself {own:.2f}"
+        rows.append(row + heaviest(found[b, h], dt))
     return rows
+
+
+def heaviest(found, dt):
+    """The largest of a head's weights (T, L + 1) on an earlier step of the flight, in words; "" without a memory."""
+    steps, backs = np.indices(found.shape)
+    earlier = np.where((backs > 0) & (backs <= steps), found, 0.0)
+    if not earlier.any():
+        return ""
+    step, back = np.unravel_index(earlier.argmax(), found.shape)
+    return f", at most {earlier.max():.2f} on another (at {dt * step:.1f} s on that of {dt * (step - back):.1f} s)"
 
 
 def gate_lines(found):

@@ -165,6 +165,12 @@ def test_another_law_has_the_lower_p95():
     assert weaker["ratio_p95"] < equivalent["ratio_p95"] - 0.02
 
 
+def test_the_heaviest_weight_is_on_an_earlier_step_of_the_flight():
+    found = np.array([[0.1, 0.0, 0.9], [0.2, 0.5, 0.3], [0.6, 0.1, 0.3]])  # the first step: 0.9 on what lies before it
+    assert attention.heaviest(found, dt=0.5) == ", at most 0.50 on another (at 0.5 s on that of 0.0 s)"
+    assert attention.heaviest(np.ones((3, 1)), dt=0.5) == ""
+
+
 def test_an_empty_folder_is_one_line(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["memory.py", str(tmp_path)])
     with pytest.raises(SystemExit, match="error: .* has no finished run"):
