@@ -1,0 +1,102 @@
+"""Whether the code of every result trains as today's: the first updates of its command, by each, to the last bit.
+
+    python benchmarks/same_training.py                          # every result: some 20 minutes of one core
+    python benchmarks/same_training.py results/di --updates 20
+
+results/commits.json says by which commit each seed was trained. The first of a result's commands, cut to `--updates`
+(curriculum and refinement are shares of a training, so they fall into it), is run by the code of each of these commits
+and by that of HEAD, each taken out of git into a temporary folder. Prints a line for each; exit status 1 if one bit of
+the weights differs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tarfile
+import tempfile
+from pathlib import Path
+
+from safetensors.numpy import load_file
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+import run_seeds  # noqa: E402
+
+COMMITS = ROOT / "results" / "commits.json"
+LISTS = [ROOT / "benchmarks" / f"{name}_jobs.txt" for name in ("result", "table_1")]
+
+
+def checkout(commit, folder):
+    """The files of a commit in an empty folder; OSError if git has no such commit."""
+    archive = folder.with_suffix(".tar")
+    got = subprocess.run(["git", "archive", "--output", archive, commit], cwd=ROOT, stderr=subprocess.PIPE, text=True)
+    if got.returncode:
+        raise OSError(f"git has no files of {commit}: {got.stderr.strip()}")
+    with tarfile.open(archive) as files:
+        files.extractall(folder, filter="data")
+    archive.unlink()
+
+
+def train(command, folder, updates):
+    """The weights after the first updates of a command by the code in a folder, by name; RuntimeError if it fails."""
+    script, *flags = command
+    runs = set((folder / "runs").glob("*"))
+    cut = [sys.executable, script, *flags, "--total-updates", str(updates)]
+    trained = subprocess.run(cut, cwd=folder, capture_output=True, text=True)
+    if trained.returncode:
+        raise RuntimeError(f"{' '.join(cut)} failed: {trained.stderr.strip()[-300:]}")
+    (run,) = set((folder / "runs").glob("*")) - runs
+    return load_file(run / "agent.safetensors")
+
+
+def differing(one, other):
+    """How many of the weights by name are not the same bits."""
+    described = [{name: (w.shape, w.dtype, w.tobytes()) for name, w in weights.items()} for weights in (one, other)]
+    return sum(described[0].get(name) != described[1].get(name) for name in one.keys() | other.keys())
+
+
+def first_jobs():
+    """The first line of each results folder: folder -> command."""
+    jobs = [job for path in LISTS for job in run_seeds.read_jobs(path)]
+    return {str(job.results): job.command for job in reversed(jobs)}
+
+
+def compare(name, commits, updates, temporary):
+    """Train a result's command by HEAD and by each commit, print a line for each; whether all gave the same bits."""
+    found = {}
+    for commit in ("HEAD", *commits):
+        folder = temporary / commit
+        if not folder.exists():
+            checkout(commit, folder)
+        found[commit] = train(first_jobs()[name], folder, updates)
+    wrong = {commit: differing(found["HEAD"], found[commit]) for commit in commits}
+    for commit, count in wrong.items():
+        verdict = f"{count} of {len(found[commit])} tensors differ" if count else "the same bits"
+        print(f"{name}, {updates} updates by {commit} and HEAD: {verdict}", flush=True)
+    return not any(wrong.values())
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("results", nargs="*", help="folders of results/commits.json; without one, all")
+    parser.add_argument("--updates", type=int, default=6, help="updates of each training")
+    options = parser.parse_args()
+    commits = json.loads(COMMITS.read_text())
+    if unknown := sorted(set(options.results) - commits.keys()):
+        sys.exit(f"error: results {', '.join(unknown)} must be among {', '.join(commits)}")
+    if options.updates < 1:
+        sys.exit(f"error: --updates {options.updates} must be at least 1")
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            names = options.results or commits
+            same = [compare(name, commits[name], options.updates, Path(folder)) for name in names]
+    except (OSError, RuntimeError) as error:
+        sys.exit(f"error: {error}")
+    sys.exit(0 if all(same) else 1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,66 @@
+"""`benchmarks/same_training.py`: code that trains otherwise is found, and every seed of the results has its commit."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import same_training
+
+ROOT = Path(__file__).parent.parent
+
+
+def test_one_bit_or_one_name_is_a_difference():
+    ours = {"a": np.arange(3, dtype=np.float32), "b": np.zeros(2, dtype=np.float32)}
+    other = {name: weight.copy() for name, weight in ours.items()}
+    assert same_training.differing(ours, other) == 0
+    other["a"][1] = np.nextafter(np.float32(1), np.float32(2))
+    assert same_training.differing(ours, other) == 1
+    assert same_training.differing(ours, {"a": ours["a"], "c": ours["b"]}) == 2
+    assert same_training.differing(ours, {**ours, "b": ours["b"].reshape(1, 2)}) == 1
+
+
+def test_code_that_trains_otherwise_is_found(tmp_path, monkeypatch, capsys):
+    """Three commits of a repository of one script: the second only renames, the third changes what is learned."""
+    script = "import numpy, pathlib, sys\nfrom safetensors.numpy import save_file\n{name} = int(sys.argv[-1])\n"
+    script += "run = pathlib.Path('runs/one'); run.mkdir(parents=True)\n"
+    script += "save_file({{'w': numpy.full(2, {name} + {change})}}, run / 'agent.safetensors')\n"
+    git = ["git", "-C", tmp_path, "-c", "user.name=a", "-c", "user.email=a@b.c"]
+    subprocess.run([*git, "init", "-q"], check=True)
+    for number, (name, change) in enumerate([("n", 0.0), ("updates", 0.0), ("updates", 1e-12)]):
+        (tmp_path / "learn.py").write_text(script.format(name=name, change=change))
+        subprocess.run([*git, "add", "learn.py"], check=True)
+        subprocess.run([*git, "commit", "-q", "-m", str(number)], check=True)
+    monkeypatch.setattr(same_training, "ROOT", tmp_path)
+    monkeypatch.setattr(same_training, "first_jobs", lambda: {"results/one": ["learn.py"]})
+    (tmp_path / "taken").mkdir()
+    assert not same_training.compare("results/one", ["HEAD~1", "HEAD~2"], 6, tmp_path / "taken")
+    lines = capsys.readouterr().out.splitlines()
+    assert lines == [f"results/one, 6 updates by HEAD~{k} and HEAD: 1 of 1 tensors differ" for k in (1, 2)]
+    subprocess.run([*git, "reset", "-q", "--hard", "HEAD~1"], check=True)
+    (tmp_path / "again").mkdir()
+    assert same_training.compare("results/one", ["HEAD~1"], 6, tmp_path / "again")
+    with pytest.raises(OSError, match="git has no files of 0000000"):
+        same_training.checkout("0000000", tmp_path / "none")
+
+
+def test_every_seed_of_the_results_has_its_commit():
+    for name, commits in json.loads(same_training.COMMITS.read_text()).items():
+        seeds = sorted(int(path.stem) for path in (ROOT / name / "seeds").glob("*.json"))
+        assert sorted(seed for trained in commits.values() for seed in trained) == seeds, name
+        assert name in same_training.first_jobs()
+
+
+@pytest.mark.parametrize(
+    "flags, said",
+    [
+        (["results/none"], "results results/none must be among results/di, "),
+        (["--updates", "0"], "--updates 0 must be at least 1"),
+    ],
+)
+def test_bad_input_is_one_line(flags, said):
+    command = [sys.executable, ROOT / "benchmarks" / "same_training.py", *flags]
+    found = subprocess.run(command, capture_output=True, text=True)
+    assert found.returncode == 1 and found.stderr.startswith(f"error: {said}") and found.stderr.count("\n") == 1
