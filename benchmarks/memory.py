@@ -1,7 +1,7 @@
 """What the memory is for: the table and the figure of results/memory, from the evaluations that its runs left there.
 
     python benchmarks/run_seeds.py benchmarks/memory_di_jobs.txt --at-once 2 --numbers      # trains what is missing
-    python benchmarks/run_seeds.py benchmarks/memory_nominal_jobs.txt --at-once 2           # the same: an hour
+    python benchmarks/run_seeds.py benchmarks/memory_nominal_jobs.txt --at-once 2           # the same: hours
     python benchmarks/run_seeds.py benchmarks/memory_rocket_jobs.txt --at-once 2 --numbers  # the same: hours
     python benchmarks/memory.py                                                             # prints, draws: seconds
 

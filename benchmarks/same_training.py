@@ -1,4 +1,4 @@
-"""Whether the code of every result trains as today's: the first updates of its command, by each, to the last bit.
+"""Whether the code of every result trains as today's: its command, cut to a few updates, by each, to the last bit.
 
     python benchmarks/same_training.py                          # every result: some 20 minutes of one core
     python benchmarks/same_training.py results/di --updates 20
@@ -41,7 +41,7 @@ def checkout(commit, folder):
 
 
 def train(command, folder, updates):
-    """The weights after the first updates of a command by the code in a folder, by name; RuntimeError if it fails."""
+    """The weights of a command cut to `updates`, by name, by the code in a folder; RuntimeError if it fails."""
     script, *flags = command
     runs = set((folder / "runs").glob("*"))
     cut = [sys.executable, script, *flags, "--total-updates", str(updates)]
@@ -64,14 +64,14 @@ def first_jobs():
     return {str(job.results): job.command for job in reversed(jobs)}
 
 
-def compare(name, commits, updates, temporary):
+def compare(name, command, commits, updates, temporary):
     """Train a result's command by HEAD and by each commit, print a line for each; whether all gave the same bits."""
     found = {}
     for commit in ("HEAD", *commits):
         folder = temporary / commit
         if not folder.exists():
             checkout(commit, folder)
-        found[commit] = train(first_jobs()[name], folder, updates)
+        found[commit] = train(command, folder, updates)
     wrong = {commit: differing(found["HEAD"], found[commit]) for commit in commits}
     for commit, count in wrong.items():
         verdict = f"{count} of {len(found[commit])} tensors differ" if count else "the same bits"
@@ -91,8 +91,8 @@ def main():
         sys.exit(f"error: --updates {options.updates} must be at least 1")
     try:
         with tempfile.TemporaryDirectory() as folder:
-            names = options.results or commits
-            same = [compare(name, commits[name], options.updates, Path(folder)) for name in names]
+            names, commands = options.results or commits, first_jobs()
+            same = [compare(name, commands[name], commits[name], options.updates, Path(folder)) for name in names]
     except (OSError, RuntimeError) as error:
         sys.exit(f"error: {error}")
     sys.exit(0 if all(same) else 1)

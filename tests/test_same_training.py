@@ -34,14 +34,13 @@ def test_code_that_trains_otherwise_is_found(tmp_path, monkeypatch, capsys):
         subprocess.run([*git, "add", "learn.py"], check=True)
         subprocess.run([*git, "commit", "-q", "-m", str(number)], check=True)
     monkeypatch.setattr(same_training, "ROOT", tmp_path)
-    monkeypatch.setattr(same_training, "first_jobs", lambda: {"results/one": ["learn.py"]})
     (tmp_path / "taken").mkdir()
-    assert not same_training.compare("results/one", ["HEAD~1", "HEAD~2"], 6, tmp_path / "taken")
+    assert not same_training.compare("results/one", ["learn.py"], ["HEAD~1", "HEAD~2"], 6, tmp_path / "taken")
     lines = capsys.readouterr().out.splitlines()
     assert lines == [f"results/one, 6 updates by HEAD~{k} and HEAD: 1 of 1 tensors differ" for k in (1, 2)]
     subprocess.run([*git, "reset", "-q", "--hard", "HEAD~1"], check=True)
     (tmp_path / "again").mkdir()
-    assert same_training.compare("results/one", ["HEAD~1"], 6, tmp_path / "again")
+    assert same_training.compare("results/one", ["learn.py"], ["HEAD~1"], 6, tmp_path / "again")
     with pytest.raises(OSError, match="git has no files of 0000000"):
         same_training.checkout("0000000", tmp_path / "none")
 
