@@ -4,6 +4,7 @@
     python benchmarks/run_seeds.py benchmarks/memory_nominal_jobs.txt --at-once 2           # the same: hours
     python benchmarks/run_seeds.py benchmarks/memory_rocket_jobs.txt --at-once 2 --numbers  # the same: hours
     python benchmarks/memory.py                                                             # prints, draws: seconds
+    python benchmarks/memory.py --by-seed                                                   # a line for each run
 
 Each row is one way of learning, each figure the median over its seeds with the range of all. Rows without a finished
 run are left out. Beside the hidden velocity stands the expected cost that no memory can beat.
@@ -39,6 +40,8 @@ class Experiment:
     keys: dict[str, str]  # key of eval.json -> what is printed of it; the first is drawn
     log: bool = False  # the figure's axis
     bound: Callable | None = None  # what no memory can beat, of the keys of which that is known: () -> {key: value}
+    folders: str = "{row}"  # of a row's runs
+    drawn: bool = True
 
 
 def lengths(*steps):
@@ -64,6 +67,12 @@ def velocity_from_the_second_step():
     return {"ratio_of_sums": flight["cost"].sum() / best["cost"].sum()}
 
 
+ROCKET_ROWS = {
+    **lengths(0, 8, 32, 128),
+    "mlp": "MLP of about the same size",
+    "true_mass": "L_mem 32, true mass seen",
+    "oracle": "L_mem 32, draw seen",
+}
 EXPERIMENTS = {
     "hidden_velocity": Experiment(
         "Double integrator, velocity hidden: cost over the optimum's, which sees it (ratio of sums)",
@@ -82,14 +91,16 @@ EXPERIMENTS = {
             "ratio_of_sums": "ratio of sums of those",
         },
     ),
+    "nominal": Experiment(
+        "Rocket, cut-off, nominal flight: the policies that the next rows begin with",
+        ROCKET_ROWS,
+        {"error_norm": "||error||", "perigee_km": "perigee (km)", "final_mass_kg": "mass (kg)"},
+        folders="seed_*/{row}",
+        drawn=False,
+    ),
     "rocket": Experiment(
         "Dispersed rocket, cut-off: ||error|| over 1705 flights",
-        {
-            **lengths(0, 8, 32, 128),
-            "mlp": "MLP of about the same size",
-            "true_mass": "L_mem 32, true mass seen",
-            "oracle": "L_mem 32, draw seen",
-        },
+        ROCKET_ROWS,
         {
             "dispersed_error_median": "median",
             "dispersed_error_p95": "p95",
@@ -102,9 +113,10 @@ EXPERIMENTS = {
 }
 
 
-def read(folder, rows):
+def read(folder, experiment):
     """The evaluations of every seed: row -> list of eval.json."""
-    paths = {row: sorted((folder / row / "seeds").glob("*.json")) for row in rows}
+    patterns = {row: f"{experiment.folders.format(row=row)}/seeds/*.json" for row in experiment.rows}
+    paths = {row: sorted(folder.glob(pattern)) for row, pattern in patterns.items()}
     return {row: [evaluate.read_json(path) for path in seeds] for row, seeds in paths.items() if seeds}
 
 
@@ -121,12 +133,14 @@ def digits(bound):
     return "-" if bound is None else f"{bound:#.3g}"
 
 
-def table(experiment, found):
-    """The lines of one experiment's table."""
-    lines = [["", "seeds", *experiment.keys.values()]]
+def table(experiment, found, by_seed=False):
+    """The lines of one experiment's table: each row's median and range, or each of its runs."""
+    lines = [["", "seed" if by_seed else "seeds", *experiment.keys.values()]]
     for row, seeds in found.items():
-        cells = [cell([run[key] for run in seeds if key in run]) for key in experiment.keys]
-        lines.append([experiment.rows[row], str(len(seeds)), *cells])
+        groups = {str(run["seed"]): [run] for run in seeds} if by_seed else {str(len(seeds)): seeds}
+        for label, group in groups.items():
+            cells = [cell([run[key] for run in group if key in run]) for key in experiment.keys]
+            lines.append([experiment.rows[row], label, *cells])
     if experiment.bound:
         bound = experiment.bound()
         lines.append(["no memory can beat", "", *(digits(bound.get(key)) for key in experiment.keys)])
@@ -170,15 +184,19 @@ def draw(results):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path, nargs="?", default=ROOT / "results" / "memory")
-    folder = parser.parse_args().folder
+    parser.add_argument("--by-seed", action="store_true", help="print each run, draw nothing")
+    options = parser.parse_args()
+    folder = options.folder
     try:
-        results = {name: read(folder / name, experiment.rows) for name, experiment in EXPERIMENTS.items()}
+        results = {name: read(folder / name, experiment) for name, experiment in EXPERIMENTS.items()}
         results = {name: found for name, found in results.items() if found}
         if not results:
             raise ValueError(f"{folder} has no finished run; benchmarks/memory_*_jobs.txt list them")
         for name, found in results.items():
-            print("\n".join(table(EXPERIMENTS[name], found)))
-        figures.save(folder, {"memory.png": draw(results)})
+            print("\n".join(table(EXPERIMENTS[name], found, options.by_seed)))
+        drawn = {name: found for name, found in results.items() if EXPERIMENTS[name].drawn}
+        if drawn and not options.by_seed:
+            figures.save(folder, {"memory.png": draw(drawn)})
     except (OSError, ValueError) as error:
         sys.exit(f"error: {error}")
 

@@ -126,6 +126,24 @@ def test_table_and_figure_of_what_is_there(tmp_path, monkeypatch, capsys):
     assert imread(folder / "memory.png").std() > 0.05
 
 
+def test_a_line_for_each_run(tmp_path, monkeypatch, capsys):
+    """Those of the nominal flight lie in a folder for each seed."""
+    for seed, error in {1: 0.25, 2: 0.5}.items():
+        seeds = tmp_path / "nominal" / f"seed_{seed}" / "mlp" / "seeds"
+        seeds.mkdir(parents=True)
+        metrics = {"env_id": "RocketAscentCutoff-v0", "seed": seed, "error_norm": error, "final_mass_kg": 7500.0}
+        (seeds / f"{seed}.json").write_text(json.dumps(metrics))
+    monkeypatch.setattr(sys, "argv", ["memory.py", str(tmp_path), "--by-seed"])
+    memory.main()
+    title, header, first, second = (re.split("  +", line.strip()) for line in capsys.readouterr().out.splitlines())
+    assert "nominal flight" in title[0] and header == ["seed", "||error||", "perigee (km)", "mass (kg)"]
+    assert first[1:] == ["1", "0.25", "-", "7500"] and second[1:] == ["2", "0.5", "-", "7500"]
+    monkeypatch.setattr(sys, "argv", ["memory.py", str(tmp_path)])
+    memory.main()
+    assert "0.375 (0.25 to 0.5)" in capsys.readouterr().out
+    assert not list(tmp_path.glob("*.png"))  # these rows are a means, not a finding
+
+
 def test_the_figure_is_whole_or_as_it_was(tmp_path, monkeypatch, capsys, cut_figures):
     evaluations(tmp_path / "hidden_velocity" / "memory_4", [1.5])
     (tmp_path / "memory.png").write_bytes(b"the old one")
@@ -200,7 +218,8 @@ def test_every_row_of_the_tables_has_its_three_jobs(tmp_path):
     (tmp_path / "jobs.txt").write_text(text)
     jobs = run_seeds.read_jobs(tmp_path / "jobs.txt")
     found = []
-    for name, experiment in memory.EXPERIMENTS.items():
+    experiments = {name: experiment for name, experiment in memory.EXPERIMENTS.items() if name != "nominal"}
+    for name, experiment in experiments.items():
         for row in experiment.rows:
             mine = [job for job in jobs if job.results == Path(os.path.normpath(f"results/memory/{name}/{row}"))]
             assert sorted(job.args["seed"] for job in mine)[:3] == [1, 2, 3], (name, row)
