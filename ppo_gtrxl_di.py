@@ -67,7 +67,7 @@ class Args:
     # PPO (Table 1 where it has a row; docs/decisions.md has the rest)
     total_updates: int = 1000  # number of updates
     num_envs: int = 80  # parallel environments, one episode each per update (256 steps of 16 workers, a guess)
-    learning_rate: float = 3e-4  # learning rate of the first update; with --lr-schedule std where the deviation is 1
+    learning_rate: float = 3e-4  # learning rate of the first update; with --lr-schedule std it is this times sigma
     learning_rate_final: float = 3e-5  # learning rate of the last update (linear in between; unused with std)
     gamma: float = 0.99  # the discount factor gamma
     gae_lambda: float = 0.95  # the lambda for the general advantage estimation
@@ -96,7 +96,7 @@ ENV_IDS = ("DoubleIntegrator-v0", "DoubleIntegratorWaypoints-v0")
 ENV_OPTIONS = ("observe_phase", "observe_velocity")  # arguments of the environments
 SIZES = dict(zip(ENV_IDS, (3, 6)))  # of an observation
 BUFFERS = {env_id: {"observation_scale": [1.0] * n} for env_id, n in SIZES.items()}  # `features` reads agent.<name>
-INITIAL_ACTION = [0.0]  # the mean before training
+INITIAL_ACTION = [0.0]  # the policy's output before training, in units of the bound
 
 
 def features(agent, obs):
@@ -109,7 +109,7 @@ def mean_action(output, action_scale):
     return output * action_scale
 
 
-def learn_buffers(agent, args, batch):
+def learn_buffers(agent, averaged, args, batch):
     """Nothing: no constant of these problems is learnt from flights."""
 
 
@@ -254,7 +254,7 @@ class Agent(nn.Module):
         self.num_blocks, self.memory_length, self.embed_dim = args.num_blocks, args.memory_length, d
         for name, value in {**BUFFERS[args.env_id], "action_scale": envs.single_action_space.high.tolist()}.items():
             self.register_buffer(name, torch.tensor(value))
-        inputs = len(features(self, torch.ones(envs.single_observation_space.shape)))
+        inputs = len(features(self, torch.ones(envs.single_observation_space.shape)))  # zeros have no direction
         self.encoder = nn.Sequential(linear(inputs, d, gain=2**0.5), nn.GELU())
         sizes = d, args.num_heads, args.memory_length, args.mlp_dim
         self.blocks = nn.ModuleList(GTrXLBlock(*sizes) for _ in range(args.num_blocks))
@@ -348,7 +348,8 @@ def rollout(agent, envs, reward_scale, memory_noise):
         batch.rewards[t] = torch.as_tensor(reward * alive * reward_scale)
         ended = alive & terminated
         for key, value in info.get("final_info", {}).items():
-            episodes.setdefault(key, value.copy())[ended] = value[ended]
+            first_episodes = episodes.setdefault(key, np.zeros_like(value))
+            first_episodes[ended] = value[ended]
         alive = alive & ~terminated  # an ended environment has started anew; only its first episode counts
         if not alive.any():
             break
@@ -453,8 +454,9 @@ def begin_refinement(agent, args):
     """From here on the noise is set, not learned; where starts are now flown in groups, V starts as their baseline."""
     if args.log_std_refine is not None:
         nn.init.constant_(agent.actor_logstd, args.log_std_refine)
-    for parameter in agent.critic[-1].parameters():
-        nn.init.zeros_(parameter)
+    if args.flights_per_start > 1:
+        for parameter in agent.critic[-1].parameters():
+            nn.init.zeros_(parameter)
 
 
 def train(args, agent, average, optimizer, envs, run):
@@ -477,7 +479,7 @@ def train(args, agent, average, optimizer, envs, run):
             learning_rate = args.learning_rate * std
         optimizer.param_groups[0]["lr"] = learning_rate
         ent_coef = linear_schedule(args.ent_coef, args.ent_coef_final, progress)
-        gae_lambda = linear_schedule(args.gae_lambda, args.gae_lambda_final, progress)
+        gae_lambda = linear_schedule(args.gae_lambda, args.gae_lambda_final, progress)  # runs.py fills a final None
         group = set_curriculum(envs, args, progress, refines, std)
 
         # lines 3-13: fly one episode in every environment
@@ -514,7 +516,7 @@ def train(args, agent, average, optimizer, envs, run):
         means["explained_variance"] = explained_variance(batch.values, batch.returns, batch.alive)
         means["baseline_explained_variance"] = explained_variance(baseline, returns, batch.alive)
 
-        learn_buffers(agent, args, batch)
+        learn_buffers(agent, average.module, args, batch)
 
         # the noise of the next update: linear to its last value, from wherever it is
         if args.noise == "schedule" or refines:

@@ -72,7 +72,7 @@ class Args:
     # PPO (docs/decisions.md has Table 1's beside ours)
     total_updates: int = 500  # number of updates
     num_envs: int = 32  # parallel environments, one episode each per update
-    learning_rate: float = 3e-3  # learning rate of the first update; with --lr-schedule std where the deviation is 1
+    learning_rate: float = 3e-3  # learning rate of the first update; with --lr-schedule std it is this times sigma
     learning_rate_final: float = 1e-5  # learning rate of the last update (linear in between; unused with std)
     gamma: float = 1.0  # the discount factor gamma
     gae_lambda: float = 0.985  # the lambda for the general advantage estimation
@@ -145,13 +145,14 @@ def features(agent, obs):
 
 
 @torch.no_grad()
-def learn_buffers(agent, args, batch):
+def learn_buffers(agent, averaged, args, batch):
     """Move `mean_flight` to the mean of an update's dispersed flights: at first all the way, then by a tenth."""
     if not args.dispersion:
         return
     if not agent.mean_flight.any():
         new_inputs = len(DIFFERENCES) + batch.obs.shape[-1] - 9  # and, with --observe-draw, the draw
-        agent.encoder[0].weight[:, -new_inputs:] = 0.0  # what comes into sight changes nothing at first
+        for network in (agent, averaged):  # what comes into sight changes nothing at first
+            network.encoder[0].weight[:, -new_inputs:] = 0.0
     rows = agent.mean_flight[: len(batch.obs)]  # a view
     alive = batch.alive[: len(rows)]
     mean, _ = moments(motion(agent, batch.obs[: len(rows)])[2], alive[..., None], 1)
@@ -306,7 +307,7 @@ class Agent(nn.Module):
         self.num_blocks, self.memory_length, self.embed_dim = args.num_blocks, args.memory_length, d
         for name, value in {**BUFFERS[args.env_id], "action_scale": envs.single_action_space.high.tolist()}.items():
             self.register_buffer(name, torch.tensor(value))
-        inputs = len(features(self, torch.ones(envs.single_observation_space.shape)))
+        inputs = len(features(self, torch.ones(envs.single_observation_space.shape)))  # zeros have no direction
         self.encoder = nn.Sequential(linear(inputs, d, gain=2**0.5), nn.GELU())
         sizes = d, args.num_heads, args.memory_length, args.mlp_dim
         self.blocks = nn.ModuleList(GTrXLBlock(*sizes) for _ in range(args.num_blocks))
@@ -400,7 +401,8 @@ def rollout(agent, envs, reward_scale, memory_noise):
         batch.rewards[t] = torch.as_tensor(reward * alive * reward_scale)
         ended = alive & terminated
         for key, value in info.get("final_info", {}).items():
-            episodes.setdefault(key, value.copy())[ended] = value[ended]
+            first_episodes = episodes.setdefault(key, np.zeros_like(value))
+            first_episodes[ended] = value[ended]
         alive = alive & ~terminated  # an ended environment has started anew; only its first episode counts
         if not alive.any():
             break
@@ -505,8 +507,9 @@ def begin_refinement(agent, args):
     """From here on the noise is set, not learned; where starts are now flown in groups, V starts as their baseline."""
     if args.log_std_refine is not None:
         nn.init.constant_(agent.actor_logstd, args.log_std_refine)
-    for parameter in agent.critic[-1].parameters():
-        nn.init.zeros_(parameter)
+    if args.flights_per_start > 1:
+        for parameter in agent.critic[-1].parameters():
+            nn.init.zeros_(parameter)
 
 
 def train(args, agent, average, optimizer, envs, run):
@@ -529,7 +532,7 @@ def train(args, agent, average, optimizer, envs, run):
             learning_rate = args.learning_rate * std
         optimizer.param_groups[0]["lr"] = learning_rate
         ent_coef = linear_schedule(args.ent_coef, args.ent_coef_final, progress)
-        gae_lambda = linear_schedule(args.gae_lambda, args.gae_lambda_final, progress)
+        gae_lambda = linear_schedule(args.gae_lambda, args.gae_lambda_final, progress)  # runs.py fills a final None
         group = set_curriculum(envs, args, progress, refines, std)
 
         # lines 3-13: fly one episode in every environment
@@ -566,7 +569,7 @@ def train(args, agent, average, optimizer, envs, run):
         means["explained_variance"] = explained_variance(batch.values, batch.returns, batch.alive)
         means["baseline_explained_variance"] = explained_variance(baseline, returns, batch.alive)
 
-        learn_buffers(agent, args, batch)
+        learn_buffers(agent, average.module, args, batch)
 
         # the noise of the next update: linear to its last value, from wherever it is
         if args.noise == "schedule" or refines:

@@ -120,7 +120,7 @@ class OurMeanFlight(BaseCallback):
         if not self.constants.mean_flight.any():
             self._come_into_sight()
         batch = SimpleNamespace(obs=torch.as_tensor(self.obs), alive=torch.as_tensor(self.alive))
-        self.script.learn_buffers(self.constants, self.args, batch)
+        self.script.learn_buffers(self.constants, self.constants, self.args, batch)
 
     @torch.no_grad()
     def _come_into_sight(self):

@@ -228,7 +228,7 @@ def test_refinement_begins_once(learner, monkeypatch, refine_from, begins):
 
 def test_refinement_in_the_middle_of_a_run(learner, asked):
     """The critic's head is zero when the first minibatch is asked for; a resume after the beginning leaves it alone."""
-    run = learner(refine_from=0.5, log_std_refine=-3.0, total_updates=11)
+    run = learner(refine_from=0.5, log_std_refine=-3.0, flights_per_start=7, total_updates=11)
     seen, encode = [], run.agent.encode
 
     def watch(*inputs):
@@ -247,11 +247,20 @@ def test_refinement_in_the_middle_of_a_run(learner, asked):
 
 
 def test_refinement_leaves_the_policy(learner):
-    run = learner(log_std_refine=-3.0)
+    run = learner(log_std_refine=-3.0, flights_per_start=2)
     hidden = torch.randn(5, 8, dtype=torch.float64)
     mean = run.agent.get_mean_action(hidden)
     script.begin_refinement(run.agent, run.args)
     assert torch.equal(run.agent.get_mean_action(hidden), mean) and not run.agent.critic(hidden).any()
+
+
+def test_refinement_without_groups_leaves_the_critic(learner):
+    """It has no baseline to begin from."""
+    run = learner(log_std_refine=-3.0, flights_per_start=1)
+    hidden = torch.randn(5, 8, dtype=torch.float64)
+    values = run.agent.critic(hidden)
+    script.begin_refinement(run.agent, run.args)
+    assert torch.equal(run.agent.critic(hidden), values) and values.any()
 
 
 @pytest.mark.parametrize("log_std_refine", [-2.0, None])
