@@ -6,7 +6,7 @@
 results/commits.json says by which commit each seed was trained. The first of a result's commands, cut to `--updates`
 (curriculum and refinement are shares of a training, so they fall into it), is run by the code of each of these commits
 and by that of HEAD, each taken out of git into a temporary folder. Prints a line for each; exit status 1 if one bit of
-the weights differs.
+what was learned differs. What is flown is these weights' average, and no part of the training.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import tarfile
 import tempfile
 from pathlib import Path
 
-from safetensors.numpy import load_file
+import torch
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
@@ -41,7 +41,7 @@ def checkout(commit, folder):
 
 
 def train(command, folder, updates):
-    """The weights of a command cut to `updates`, by name, by the code in a folder; RuntimeError if it fails."""
+    """What a command cut to `updates` learns, by name, by the code in a folder; RuntimeError if it fails."""
     script, *flags = command
     runs = set((folder / "runs").glob("*"))
     cut = [sys.executable, script, *flags, "--total-updates", str(updates)]
@@ -49,13 +49,17 @@ def train(command, folder, updates):
     if trained.returncode:
         raise RuntimeError(f"{' '.join(cut)} failed: {trained.stderr.strip()[-300:]}")
     (run,) = set((folder / "runs").glob("*")) - runs
-    return load_file(run / "agent.safetensors")
+    return torch.load(run / "training_state.pt", map_location="cpu", weights_only=True)["agent"]
+
+
+def bits(weight):
+    return weight.dtype, weight.shape, weight.numpy().tobytes()
 
 
 def differing(one, other):
     """How many of the weights by name are not the same bits."""
-    described = [{name: (w.shape, w.dtype, w.tobytes()) for name, w in weights.items()} for weights in (one, other)]
-    return sum(described[0].get(name) != described[1].get(name) for name in one.keys() | other.keys())
+    of_both = one.keys() & other.keys()
+    return len(one.keys() ^ other.keys()) + sum(bits(one[name]) != bits(other[name]) for name in of_both)
 
 
 def first_jobs():

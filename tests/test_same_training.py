@@ -5,18 +5,18 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 import same_training
+import torch
 
 ROOT = Path(__file__).parent.parent
 
 
 def test_one_bit_or_one_name_is_a_difference():
-    ours = {"a": np.arange(3, dtype=np.float32), "b": np.zeros(2, dtype=np.float32)}
-    other = {name: weight.copy() for name, weight in ours.items()}
+    ours = {"a": torch.arange(3.0), "b": torch.zeros(2)}
+    other = {name: weight.clone() for name, weight in ours.items()}
     assert same_training.differing(ours, other) == 0
-    other["a"][1] = np.nextafter(np.float32(1), np.float32(2))
+    other["a"][1] = torch.nextafter(torch.tensor(1.0), torch.tensor(2.0))
     assert same_training.differing(ours, other) == 1
     assert same_training.differing(ours, {"a": ours["a"], "c": ours["b"]}) == 2
     assert same_training.differing(ours, {**ours, "b": ours["b"].reshape(1, 2)}) == 1
@@ -24,9 +24,10 @@ def test_one_bit_or_one_name_is_a_difference():
 
 def test_code_that_trains_otherwise_is_found(tmp_path, monkeypatch, capsys):
     """Three commits of a repository of one script: the second only renames, the third changes what is learned."""
-    script = "import numpy, pathlib, sys\nfrom safetensors.numpy import save_file\n{name} = int(sys.argv[-1])\n"
+    script = "import pathlib, sys, torch\n{name} = int(sys.argv[-1])\n"
     script += "run = pathlib.Path('runs/one'); run.mkdir(parents=True)\n"
-    script += "save_file({{'w': numpy.full(2, {name} + {change})}}, run / 'agent.safetensors')\n"
+    script += "learned = torch.full((2,), {name} + {change}, dtype=torch.float64)\n"
+    script += "torch.save({{'agent': {{'w': learned}}}}, run / 'training_state.pt')\n"
     git = ["git", "-C", tmp_path, "-c", "user.name=a", "-c", "user.email=a@b.c"]
     subprocess.run([*git, "init", "-q"], check=True)
     for number, (name, change) in enumerate([("n", 0.0), ("updates", 0.0), ("updates", 1e-12)]):
