@@ -532,7 +532,7 @@ def train(args, agent, average, optimizer, envs, run):
             learning_rate = args.learning_rate * std
         optimizer.param_groups[0]["lr"] = learning_rate
         ent_coef = linear_schedule(args.ent_coef, args.ent_coef_final, progress)
-        gae_lambda = linear_schedule(args.gae_lambda, args.gae_lambda_final, progress)  # runs.py has put --gae-lambda for None
+        gae_lambda = linear_schedule(args.gae_lambda, args.gae_lambda_final, progress)  # None: by now --gae-lambda
         group = set_curriculum(envs, args, progress, refines, std)
 
         # lines 3-13: fly one episode in every environment

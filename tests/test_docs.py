@@ -129,7 +129,8 @@ def test_the_front_page_says_what_the_results_hold(result):
     assert row["seeds"] == COUNTS[count]
     *before, minutes = row["minutes"].split(" + ")
     assert minutes == f"{np.median(found['wall_seconds']) / 60:.0f}"
-    assert before == ([row_of("rocket_cutoff")["minutes"]] if result == "rocket_dispersed" else [])  # it goes on from it
+    goes_on_from = [row_of("rocket_cutoff")["minutes"]] if result == "rocket_dispersed" else []
+    assert before == goes_on_from
     if result in OTHERS:
         assert (found["hit_rate"] == 1).all()  # as the first line below the table says
     for column, figures in zip(("optimum", "here"), measured(result, found)):
