@@ -2,7 +2,7 @@
 
 It resembles a Falcon 9 without landing, with a payload of 20 t to the space station's orbit. The numbers are rounded
 from what is public of it (stage 1: 411 t of propellant, 22.2 t dry, 7.6 MN at sea level, 162 s; stage 2: 107.5 t, 4 t
-dry, 934 kN, 397 s, 348 s of specific impulse; 3.7 m across): an example, not a model of that launcher.
+dry, 934 kN, 348 s of specific impulse, which make 393 s; 3.7 m across): an example, not a model of that launcher.
 """
 
 import envs
