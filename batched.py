@@ -81,11 +81,13 @@ class BatchedEnv(VectorEnv):
         self.action_space = batch_space(single_action_space, num_envs)
         self.t = np.zeros(num_envs, dtype=np.int64)  # steps flown in the running episode
         self.flights_per_start = 1
+        self._was_reset = False
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
         """Start every environment anew; returns (N, obs) float64 and an empty info."""
         super().reset(seed=seed)
         self._restart(np.ones(self.num_envs, dtype=bool), options)
+        self._was_reset = True
         return self._observe(), {}
 
     def step(self, actions):
@@ -101,7 +103,12 @@ class BatchedEnv(VectorEnv):
         return obs, rewards, terminated, np.zeros(self.num_envs, dtype=bool), info
 
     def advance(self, actions):
-        """Fly one step without autoreset: `(obs, rewards, terminated, final_info)`. BadInput names a bad action."""
+        """Fly one step without autoreset: `(obs, rewards, terminated, final_info)`.
+
+        BadInput names a bad action; ResetNeeded where there was no reset yet.
+        """
+        if not self._was_reset:
+            raise ResetNeeded("no episode is running: call reset() first")
         actions = np.asarray(actions)
         if actions.dtype.kind not in "fiu":
             raise BadInput(f"actions are of type {actions.dtype}; they must be real numbers")
@@ -143,8 +150,8 @@ class BatchedEnv(VectorEnv):
         return np.repeat(draw(-(-count // group)), group, axis=0)[:count]  # rounded up
 
     def _restart(self, mask, options):
+        self._start(mask, options or {})  # first: it may refuse the options
         self.t[mask] = 0
-        self._start(mask, options or {})
         if self.render_mode is not None:
             for k in np.flatnonzero(mask):
                 self._trails[k] = []

@@ -724,6 +724,9 @@ def publish(run_dir, folder, ship: bool = False, numbers: bool = False):
             redraw(staged)
             animate(staged)
         files = [path for path in staged.rglob("*") if path.is_file()]
+        if ships:
+            for name in ("opponents.json", "figures/opponents.png", "figures/dispersed.png"):  # of the replaced policy
+                (folder / name).unlink(missing_ok=True)
         for path in sorted(files, key=lambda path: (path == last, path)):
             target = folder / path.relative_to(staged)
             target.parent.mkdir(parents=True, exist_ok=True)

@@ -147,12 +147,12 @@ def features(agent, obs):
 @torch.no_grad()
 def learn_buffers(agent, averaged, args, batch):
     """Move `mean_flight` to the mean of an update's dispersed flights: at first all the way, then by a tenth."""
-    if not args.dispersion:
-        return
-    if not agent.mean_flight.any():
-        new_inputs = len(DIFFERENCES) + batch.obs.shape[-1] - 9  # and, with --observe-draw, the draw
+    if (args.dispersion or args.observe_draw) and not agent.mean_flight.any():
+        new_inputs = len(DIFFERENCES) + batch.obs.shape[-1] - 9  # and the draw, all zeros on nominal flights
         for network in (agent, averaged):  # what comes into sight changes nothing at first
             network.encoder[0].weight[:, -new_inputs:] = 0.0
+    if not args.dispersion:
+        return
     rows = agent.mean_flight[: len(batch.obs)]  # a view
     alive = batch.alive[: len(rows)]
     mean, _ = moments(motion(agent, batch.obs[: len(rows)])[2], alive[..., None], 1)

@@ -243,6 +243,8 @@ def check_burns(rocket: Rocket):
             refuse_unless(0 < number <= has, field, number, allowed)
             used[engine] = used.get(engine, 0.0) + number * engine.flow(rocket.table_isp) * (burn.end - start)
         start = burn.end
+    last, allowed = rocket.burns[-1].dropped, "must be empty: the last burn's engines stay aboard"
+    refuse_unless(not last, f"burns[{k}].dropped", f"{last!r:.60}", allowed)
     first = engines_aboard(rocket, 0)
     runs_dry = [engine for _, engine in rocket.burns[-1].engines] if rocket.table_isp else []
     for k, burn in enumerate(rocket.burns):
@@ -278,6 +280,15 @@ class Mission:
     late: float = 300.0  # s after which it is late
     guided_until: float | None = None  # s until which R_guidance has a reference pitch (none: the first burn's end)
     mass_unit: float | None = None  # kg whose burning --mass-weight prices (none: 6 % of the dry mass)
+
+    def __post_init__(self):
+        for name in ("ceiling_km", "floor_km", "late", "guided_until", "mass_unit"):
+            value = getattr(self, name)
+            number = isinstance(value, int | float | np.number) and np.isfinite(value)
+            optional = name not in ("floor_km", "late")
+            allowed = "must be positive and finite, or None" if optional else "must be a finite number"
+            possible = value is None or (number and value > 0) if optional else number
+            refuse_unless(possible, f"a mission's {name}", value, allowed)
 
     @property
     def ceiling(self) -> float:

@@ -42,13 +42,13 @@ RANGES = {  # lowest and highest value of every numeric flag; NaN and infinity a
     **dict.fromkeys(["seed", "eval_seed", "num_threads", "eval_every"], (0, 2**31 - 1)),
     **dict.fromkeys(["total_updates", "num_envs", "num_minibatches", "update_epochs", "radius_curriculum"], (1, 10**6)),
     **dict.fromkeys(["embed_dim", "num_heads", "mlp_dim", "hidden_dim"], (1, 8192)),
-    **dict.fromkeys(["learning_rate", "learning_rate_final", "clip_coef", "weight_average"], (0.0, 1.0)),
+    **dict.fromkeys(["learning_rate", "learning_rate_final", "clip_coef"], (0.0, 1.0)),
     **dict.fromkeys(["gamma", "gae_lambda", "gae_lambda_final", "memory_noise", "refine_from"], (0.0, 1.0)),
     **dict.fromkeys(["ent_coef", "ent_coef_final", "vf_coef", "mass_weight"], (0.0, 1e3)),
     **dict.fromkeys(["reward_scale", "max_grad_norm", "target_kl"], (1e-9, 1e9)),
     **dict.fromkeys(["log_std", "log_std_refine", "log_std_final"], (-8.0, 0.5)),
     **{"eval_starts": (10, 10**6), "num_blocks": (0, 64), "memory_length": (0, 8192)},
-    **{"flights_per_start": (1, 10**6), "dispersion": (0.0, 10.0)},
+    **{"flights_per_start": (1, 10**6), "dispersion": (0.0, 10.0), "weight_average": (0.0, 0.99999)},
 }
 CHOICES = {"action_frame": ("local", "eci"), "guidance": ("none", "linear", "knots")}
 CHOICES |= {"noise": ("learned", "schedule"), "lr_schedule": ("linear", "std")}
@@ -156,13 +156,25 @@ def check(args, typed, env_ids):
             refuse(name, value, f"must be one of {', '.join(choices[name])}")
     if args.embed_dim % args.num_heads:
         refuse("num_heads", args.num_heads, f"must divide --embed-dim {args.embed_dim}")
-    for name in ("eval_json", "eval_npz"):
-        path = getattr(args, name)
-        if path is not None and not (args.eval_only and Path(path).parent.is_dir()):
-            refuse(name, path, "only with --eval-only, and must be in an existing folder")
+    check_outputs(args)
     if args.track and importlib.util.find_spec("wandb") is None:
         refuse("track", "", "needs wandb: pip install wandb")
     check_share(args, typed)
+
+
+def check_outputs(args):
+    """Refuse an --eval-json or --eval-npz that cannot be written, or would replace another file of the command."""
+    taken = {Path(args.checkpoint or "").resolve()}
+    for name in ("eval_json", "eval_npz"):
+        value = getattr(args, name)
+        if value is None:
+            continue
+        path = Path(value).resolve()
+        if not args.eval_only or path.is_dir() or not os.access(path.parent, os.W_OK):
+            refuse(name, value, "only with --eval-only, and must be a file in an existing, writable folder")
+        if path in taken:
+            refuse(name, value, "must be a file of its own, neither --checkpoint nor --eval-json")
+        taken.add(path)
 
 
 def check_buffers(args, buffers):
@@ -177,12 +189,13 @@ def check_buffers(args, buffers):
     scale = buffers.get("observation_scale")
     if scale is None:
         return
+    where = f"BUFFERS of {type(args)().exp_name}.py: observation_scale of {args.env_id}"
     inputs = gym.spaces.flatdim(gym.make_vec(spec, num_envs=1).single_observation_space)
     if len(scale) != inputs:
         allowed = f"must hold {inputs} numbers, one for each of its observations"
-        fail(f"BUFFERS of {args.exp_name}.py: observation_scale of {args.env_id} holds {len(scale)}; {allowed}")
+        fail(f"{where} holds {len(scale)}; {allowed}")
     if not all(math.isfinite(number) and number for number in scale):
-        fail(f"BUFFERS of {args.exp_name}.py: observation_scale of {args.env_id} is {scale}; must be finite, without 0")
+        fail(f"{where} is {scale}; must be finite, without 0")
 
 
 def check_share(args, typed):
@@ -354,14 +367,19 @@ class Run:
     def __exit__(self, kind, error, traceback):
         if self.writer:
             self.writer.flush()
+        if error is None:
+            return
         if not isinstance(error, KeyboardInterrupt | FloatingPointError):
+            with contextlib.suppress(OSError):  # a full disk is perhaps what ended it
+                self.save()
             return
         self.save()
         updates, saved = self.state["progress"]["total_updates"], self.args.save_model and self.rank == 0
         if isinstance(error, FloatingPointError):
             kept = f"; the last good checkpoint is {self.folder}/training_state.pt" if saved else ""
             fail(f"update {updates + 1}: {error}, must be finite{kept}")
-        kept = f"go on with: python {self.args.exp_name}.py --resume {self.folder}" if saved else "nothing saved"
+        script = type(self.args)().exp_name
+        kept = f"go on with: python {script}.py --resume {self.folder}" if saved else "nothing saved"
         if self.rank == 0:
             print(f"stopped after update {updates}; {kept}")
 
@@ -380,10 +398,8 @@ class Run:
         self.progress = {**self.progress, "total_updates": iteration, "wall_seconds": now - self.began}
         self.progress["global_step"] += steps
         self.progress["training_seconds"] += now - self.update_began
-        self.state = training_state(args, self.modules, self.envs, self.progress)
+        state = training_state(args, self.modules, self.envs, self.progress)
         if self.rank == 0:
-            if iteration % SAVE_EVERY == 0 or iteration == args.total_updates:
-                self.save()
             if args.eval_every and iteration % args.eval_every == 0:
                 self.metrics, _ = self.evaluate(TRAINING_EVAL_SEED)
                 self.log("eval", self.metrics)
@@ -394,6 +410,9 @@ class Run:
             self.log("losses", losses)
             if iteration % (args.eval_every or max(1, args.total_updates // 100)) == 0 or iteration == 1:
                 self.print_line(episodes)
+        self.state = state  # only now: where an evaluation is interrupted, a resume makes its update again
+        if iteration % SAVE_EVERY == 0 or iteration == args.total_updates:
+            self.save()
         self.update_began = time.time()
 
     def print_line(self, episodes):

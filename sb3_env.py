@@ -34,9 +34,13 @@ class NativeVecEnv(VecEnv):
         super().__init__(batch.num_envs, batch.single_observation_space, batch.single_action_space)
 
     def reset(self):
-        """Start every copy anew, with the seed of `seed()` the first time after it; (N, obs)."""
-        obs, _ = self.batch.reset(seed=self._seeds[0])
+        """Start every copy anew, the first time after them with the seed of `seed()` and `set_options()`; (N, obs).
+
+        The options are the batch's, of all copies at once.
+        """
+        obs, _ = self.batch.reset(seed=self._seeds[0], options=self._options[0])
         self._reset_seeds()
+        self._reset_options()
         return obs.astype(np.float32)
 
     def step_async(self, actions):

@@ -128,6 +128,12 @@ def cell(values):
     return middle if len(values) == 1 else f"{middle} ({low} to {high})"
 
 
+def cell_of(runs, key):
+    """The cell of a key, with the number of runs that have it where not all do: without a hit there is no ratio."""
+    values = [run[key] for run in runs if key in run]
+    return f"{cell(values)}, {len(values)} of {len(runs)}" if 0 < len(values) < len(runs) else cell(values)
+
+
 def digits(bound):
     """A bound to the three digits to which it is known; "-" without one."""
     return "-" if bound is None else f"{bound:#.3g}"
@@ -139,7 +145,7 @@ def table(experiment, found, by_seed=False):
     for row, seeds in found.items():
         groups = {str(run["seed"]): [run] for run in seeds} if by_seed else {str(len(seeds)): seeds}
         for label, group in groups.items():
-            cells = [cell([run[key] for run in group if key in run]) for key in experiment.keys]
+            cells = [cell_of(group, key) for key in experiment.keys]
             lines.append([experiment.rows[row], label, *cells])
     if experiment.bound:
         bound = experiment.bound()

@@ -56,7 +56,7 @@ PEERS = {
     "lstm": Peer("LSTM, cut-off, a tenth", f"{LSTM} {LOW_PRICE}", ROCKET_KEYS, (1,)),
     "lstm_dispersed": Peer(
         "LSTM, from there, dispersed",
-        f"{LSTM} --dispersion 1 --mass-weight 0.5 --log-std -3.5",
+        f"{LSTM} --dispersion 1 --mass-weight 0.5 --log-std -3.5 --learning-rate 1e-4",  # with 1e-3 it loses the orbit
         DISPERSED_KEYS,
         (1,),
         start="lstm",

@@ -52,7 +52,7 @@ class Job:
         return None
 
     def is_trained(self):
-        """Whether its evaluation is whole: eval.npz is written after eval.json."""
+        """Whether its evaluation is whole: eval.json is written after eval.npz."""
         run = self.run_dir()
         return run is not None and all((run / name).exists() for name in ("eval.json", "eval.npz"))
 

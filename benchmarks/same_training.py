@@ -97,7 +97,7 @@ def main():
         with tempfile.TemporaryDirectory() as folder:
             names, commands = options.results or commits, first_jobs()
             same = [compare(name, commands[name], commits[name], options.updates, Path(folder)) for name in names]
-    except (OSError, RuntimeError) as error:
+    except (OSError, RuntimeError, ValueError) as error:
         sys.exit(f"error: {error}")
     sys.exit(0 if all(same) else 1)
 

@@ -257,6 +257,8 @@ def parse_args():
         low, high = runs.RANGES.get(name, (None, None))
         if low is not None and value is not None and not low <= value <= high:
             parser.error(f"{flag(name)} {value}: must be between {low} and {high}")
+    if options.seed == 0:
+        parser.error("--seed 0: must be at least 1; the evaluation's starts are those of seed 0")
     for name in ("dispersion", "mass_weight"):
         if getattr(options, name) is not None and options.env_id not in envs.ROCKETS:
             parser.error(f"{flag(name)} {getattr(options, name)}: only a rocket has it, not {options.env_id}")

@@ -614,6 +614,18 @@ def test_bad_draws_are_refused(draw, message):
     np.testing.assert_array_equal(batch.draw, before)
 
 
+def test_a_refused_reset_leaves_the_flight_as_it_was():
+    batch, other = make(CUTOFF), make(CUTOFF)
+    up = np.array([[1.0, 0.0, 0.0]])
+    for env in (batch, other):
+        env.reset(seed=0)
+        env.advance(up)
+    with pytest.raises(BadInput):
+        batch.reset(options={"draw": np.zeros(15)})
+    for one, another in zip(batch.advance(up), other.advance(up)):
+        np.testing.assert_equal(one, another)
+
+
 def test_bad_options_are_refused():
     with pytest.raises(BadInput, match="'draw'.*without dispersion a rocket has no options"):
         gym.make_vec(CUTOFF).reset(options={"draw": np.zeros((1, 16))})

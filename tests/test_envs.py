@@ -354,6 +354,13 @@ def test_single_environment_is_the_vector_environment(env_id):
 
 
 @pytest.mark.parametrize("env_id", PROBLEMS)
+def test_a_batch_needs_a_reset(env_id):
+    env = gym.make_vec(env_id, num_envs=2)
+    with pytest.raises(ResetNeeded, match=r"call reset\(\) first"):
+        env.step(np.zeros(env.action_space.shape))
+
+
+@pytest.mark.parametrize("env_id", PROBLEMS)
 def test_steps_outside_an_episode_are_refused(env_id):
     """Before the first reset, after the end, after a refused reset; a refused action ends nothing."""
     env = gym.make(env_id, disable_env_checker=True).unwrapped  # Gymnasium's wrapper refuses the first step by itself

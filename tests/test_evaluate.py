@@ -560,7 +560,9 @@ def test_shipping_another_seed_replaces_all_or_nothing(tmp_path, monkeypatch, ca
 
     for function, name in (("redraw", "training.png"), ("animate", "animation.gif")):
         monkeypatch.setattr(evaluate, function, draw(name))
+    (results / "opponents.json").write_text("of seed 1")
     command_line(monkeypatch, capsys, "publish", second, results, "--ship")
+    assert not (results / "opponents.json").exists()
     for name in ("agent.safetensors", "figures/training.png", "figures/animation.gif"):
         assert (results / name).read_bytes() == b"weights of seed 2"
     assert json.loads((results / "eval.json").read_text())["seed"] == 2

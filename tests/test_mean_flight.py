@@ -155,3 +155,13 @@ def test_the_oracles_draw_changes_nothing_at_first(flights):
     assert (encode(seen) != before).any()
     script.learn_buffers(agent, agent, args, seen)
     torch.testing.assert_close(encode(seen), before, rtol=0, atol=0)
+
+
+def test_a_nominal_training_leaves_the_draw_without_weight(flights):
+    """So that the first dispersed update flies the nominal policy, not what random weights on the draw make of it."""
+    args = script.Args(**SMALL, env_id=CUTOFF, observe_draw=True)
+    agent = script.Agent(args, gym.make_vec(CUTOFF, num_envs=1, observe_draw=True)).double()
+    seen = script.Batch(**{**vars(flights), "obs": torch.cat([flights.obs, torch.zeros(60, 8, 16)], dim=-1)})
+    script.learn_buffers(agent, agent, args, seen)
+    assert not agent.encoder[0].weight[:, -23:].any() and agent.encoder[0].weight[:, -24].any()
+    assert not agent.mean_flight.any()

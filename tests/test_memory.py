@@ -126,6 +126,13 @@ def test_table_and_figure_of_what_is_there(tmp_path, monkeypatch, capsys):
     assert imread(folder / "memory.png").std() > 0.05
 
 
+def test_a_cell_says_of_how_many_seeds_it_is():
+    """Where no start hit every circle there is no ratio."""
+    runs = [{"hit_rate": 1.0, "ratio_of_sums": 1.05}, {"hit_rate": 0.0}, {"hit_rate": 0.0}]
+    assert memory.cell_of(runs, "ratio_of_sums") == "1.05, 1 of 3"
+    assert memory.cell_of(runs, "hit_rate") == "0 (0 to 1)" and memory.cell_of(runs[1:], "ratio_of_sums") == "-"
+
+
 def test_a_line_for_each_run(tmp_path, monkeypatch, capsys):
     """Those of the nominal flight lie in a folder for each seed."""
     for seed, error in {1: 0.25, 2: 0.5}.items():

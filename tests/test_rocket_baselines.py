@@ -356,6 +356,17 @@ def test_another_ceiling_is_another_reference(monkeypatch, flights, ceiling_km):
     assert [(case.ceiling, case.free) for case in solved] == [(np.inf if ceiling_km is None else 260e3, False)]
 
 
+@pytest.mark.parametrize("changed", [{"cutoff": False}, {"cutoff": False, "ceiling_km": 300.0}])
+def test_another_rule_of_a_vehicle_is_another_reference(monkeypatch, changed):
+    """Its stored optimum still reaches the orbit: earlier than at the end time, and above the ceiling."""
+    monkeypatch.setattr(rocket_baselines, "solve_ascent", refuse)
+    env_id = "TwoStageLEO-v0"
+    rocket_reference(env_id)
+    monkeypatch.setitem(ROCKETS, env_id, replace(ROCKETS[env_id], **changed))
+    with pytest.raises(AssertionError, match="solved anew"):
+        rocket_reference(env_id)
+
+
 def test_options_change_what_is_solved(monkeypatch, flights):
     solved = []
     numbers = {"final_mass_kg": 7000.0, "final_time_s": 924.0}

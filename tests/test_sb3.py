@@ -62,6 +62,14 @@ def test_sac_learns_on_a_single_environment(env_id):
     assert env.action_space.contains(model.predict(env.reset()[0])[0].astype(np.float64))
 
 
+def test_options_are_those_of_the_next_reset():
+    env, x0 = NativeVecEnv(gym.make_vec("DoubleIntegrator-v0", num_envs=3)), np.full((3, 2), 0.5)
+    env.seed(0)
+    env.set_options({"x0": x0})
+    np.testing.assert_allclose(env.reset()[:, :2], x0)
+    assert (env.reset()[:, :2] != x0).all()
+
+
 def test_native_batch_flies_as_a_dummy_of_single_rockets():
     """The same actions through both, over a crash and into the next episode."""
     env_id, steps = "RocketAscent-v0", 40

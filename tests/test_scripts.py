@@ -732,11 +732,43 @@ def test_resume_after_a_crash(uninterrupted, fresh_folder, monkeypatch):
     """Killed in the fourth update, saved after the second: the third is flown again."""
     fresh_folder("crash")
     monkeypatch.setattr(runs, "SAVE_EVERY", 2)
+    monkeypatch.setattr(runs.Run, "__exit__", lambda *error: None)  # as a killed process leaves it
     stop_in_update(monkeypatch, 4, RuntimeError("killed"))
     with pytest.raises(RuntimeError, match="killed"):
         DI.main([*TINY, "--total-updates=4"])
     assert state_of(run_folder())["progress"]["total_updates"] == 2
     assert_resumes(uninterrupted)
+
+
+def test_an_error_saves_what_was_learned(uninterrupted, fresh_folder, monkeypatch):
+    fresh_folder("error")
+    stop_in_update(monkeypatch, 4, RuntimeError("out of memory"))
+    with pytest.raises(RuntimeError, match="out of memory"):
+        DI.main([*TINY, "--total-updates=4"])
+    assert state_of(run_folder())["progress"]["total_updates"] == 3
+    assert_resumes(uninterrupted)
+
+
+def test_an_interrupted_evaluation_is_made_again(uninterrupted, fresh_folder, monkeypatch, capsys):
+    """Its update is not counted yet, so that no row of TensorBoard is missing after the resume."""
+    fresh_folder("in_an_evaluation")
+    evaluated, evaluate_run = [], runs.Run.evaluate
+
+    def interrupted(run, eval_seed):
+        evaluated.append(run.updates_done)
+        if len(evaluated) == 2:
+            raise KeyboardInterrupt
+        return evaluate_run(run, eval_seed)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(runs.Run, "evaluate", interrupted)
+        DI.main([*TINY, "--total-updates=4", "--eval-every=1", "--exp-name=mine"])
+    assert f"python ppo_gtrxl_di.py --resume {run_folder()}" in capsys.readouterr().out
+    assert state_of(run_folder())["progress"]["total_updates"] == 1
+    DI.main([f"--resume={run_folder()}"])
+    for tag in ("losses/policy_loss", "eval/ratio_of_sums"):
+        steps = [step for step, _ in scalars(run_folder())[tag]]
+        assert steps[:4] == [100, 200, 300, 400]  # the fifth is the reported evaluation
 
 
 def test_resume_of_a_run_that_began_from_a_checkpoint(trained, fresh_folder, monkeypatch):
@@ -798,18 +830,6 @@ def test_seconds_of_training_and_of_all(fresh_folder, monkeypatch):
     for name in CLOCKS:
         assert first[name] < last[name] < time.time() - began - pause, name
     assert 0.6 < last["wall_seconds"] - last["training_seconds"]  # two updates after which it was evaluated
-
-
-def test_ctrl_c_in_an_evaluation_saves_too(fresh_folder, monkeypatch):
-    fresh_folder("ctrl_c_in_evaluation")
-
-    def interrupted(*inputs, **options):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(runs.evaluate, "evaluate", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        DI.main([*TINY, "--total-updates=2", "--eval-every=1"])
-    assert state_of(run_folder())["progress"]["total_updates"] == 1
 
 
 def test_nan_keeps_and_names_the_last_good_checkpoint(fresh_folder, monkeypatch):
@@ -894,9 +914,13 @@ def test_numbers_are_all_there():
     assert {field.name for field in NUMBERS} >= set(POSITIVE.split()) and len(NUMBERS) >= 28
 
 
-@pytest.mark.parametrize("name", ["gamma", "gae_lambda", "clip_coef", "learning_rate", "weight_average"])
+@pytest.mark.parametrize("name", ["gamma", "gae_lambda", "clip_coef", "learning_rate"])
 def test_shares_end_at_one(refuses, name):
     assert f"{flag(name)} 1.5: must be between 0.0 and 1.0" in refuses(flag(name), 1.5)
+
+
+def test_an_average_that_never_moves_is_refused(refuses):
+    assert "--weight-average 1.0: must be between 0.0 and 0.99999" in refuses("--weight-average", "1")
 
 
 @pytest.mark.parametrize("argv", [["--num-envs", "nan"], ["--num-envs", "2.5"], ["--gamma", "x"], ["--no-such-flag"]])
@@ -912,6 +936,9 @@ def test_unknown_id(refuses, script, env_id):
     assert message.startswith(f"error: --env-id {env_id}: ") and all(known in message for known in script.ENV_IDS)
 
 
+SHIPPED = ["--eval-only", "--checkpoint", ROOT / "results" / "di" / "agent.safetensors"]
+
+
 @pytest.mark.parametrize(
     "argv, line",
     [
@@ -924,6 +951,9 @@ def test_unknown_id(refuses, script, env_id):
         (["--eval-only"], "--checkpoint"),
         (["--eval-json", "a.json"], "--eval-json a.json: only with --eval-only"),
         (["--eval-npz", "a.npz"], "--eval-npz a.npz: only with --eval-only"),
+        ([*SHIPPED, "--eval-json", "."], "--eval-json .: only with --eval-only, and must be a file in an existing"),
+        ([*SHIPPED, "--eval-json=a.x", "--eval-npz=a.x"], "--eval-npz a.x: must be a file of its own"),
+        ([*SHIPPED, "--eval-json", SHIPPED[-1]], "agent.safetensors: must be a file of its own"),
     ],
     ids=lambda value: " ".join(map(str, value)) if isinstance(value, list) else "",
 )

@@ -63,6 +63,13 @@ REFUSED = {
     "propellant of burns[1].engines": lambda: two_stages(last=556.0),
     "propellant of burns[0].engines": lambda: two_stages(replace(FIRST, isp=305.0), table_isp=True),
     "it must be dropped by this burn or a later one, or burn in the last": lambda: two_stages(dropped=0),
+    "it must be empty: the last burn's engines stay aboard": lambda: replace(
+        TWO, burns=(TWO.burns[0], replace(TWO.burns[1], dropped=((1, SECOND),)))
+    ),
+    "a mission's ceiling_km is nan; it must be positive": lambda: envs.Mission(two_stages(), ceiling_km=np.nan),
+    "a mission's mass_unit is -5; it must be positive": lambda: envs.Mission(two_stages(), mass_unit=-5),
+    "a mission's guided_until is 0; it must be positive": lambda: envs.Mission(two_stages(), guided_until=0),
+    "a mission's late is None; it must be a finite": lambda: envs.Mission(two_stages(), late=None),
     "a burn's engines is (1, Engine(": lambda: Burn(162.0, (1, FIRST)),
     "a burn's dropped is ": lambda: Burn(162.0, ((1, FIRST),), dropped=[(1, FIRST)]),
     "a rocket's a is 6778.145 m": lambda: replace(TWO, a=6778.145),
