@@ -723,14 +723,21 @@ def publish(run_dir, folder, ship: bool = False, numbers: bool = False):
                 write_bytes(staged / file, (run_dir / file).read_bytes())
             redraw(staged)
             animate(staged)
-        files = [path for path in staged.rglob("*") if path.is_file()]
-        if ships:
-            for name in ("opponents.json", "figures/opponents.png", "figures/dispersed.png"):  # of the replaced policy
-                (folder / name).unlink(missing_ok=True)
-        for path in sorted(files, key=lambda path: (path == last, path)):
-            target = folder / path.relative_to(staged)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            write_bytes(target, path.read_bytes())
+            for file in OF_ONE_POLICY:
+                (folder / file).unlink(missing_ok=True)
+        move(staged, folder, last)
+
+
+OF_ONE_POLICY = ("opponents.json", "figures/opponents.png", "figures/dispersed.png")  # another's would look current
+
+
+def move(staged, folder, last):
+    """Put every file of `staged` into a folder, one of them last."""
+    files = [path for path in staged.rglob("*") if path.is_file()]
+    for path in sorted(files, key=lambda path: (path == last, path)):
+        target = folder / path.relative_to(staged)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        write_bytes(target, path.read_bytes())
 
 
 def redraw(folder) -> list[Path]:
