@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import importlib
 import os
+import signal
 import sys
 from pathlib import Path
 
@@ -18,6 +19,9 @@ import envs
 
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
 import one_update  # noqa: E402
+
+# a shell starts what it sends to the background with Ctrl-C ignored, and so would be what a test starts and interrupts
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 class UnevenEnvs:

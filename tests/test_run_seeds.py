@@ -26,7 +26,7 @@ def start(folder, lines):
 
 def test_run_seeds_survives_a_restart(tmp_path):
     """Two seeds, interrupted once both train; the second start goes on with both, the third has nothing to do."""
-    lines = [f"results/tiny ppo_gtrxl_di.py --seed {seed} --total-updates 300 {TINY}  # seed {seed}" for seed in (1, 2)]
+    lines = [f"results/tiny ppo_gtrxl_di.py --seed {seed} --total-updates 150 {TINY}  # seed {seed}" for seed in (1, 2)]
     first = start(tmp_path, ["# two seeds", "", *lines])
     while first.poll() is None and len(list(tmp_path.glob("runs/*/training_state.pt"))) < 2:
         time.sleep(0.02)
@@ -42,7 +42,7 @@ def test_run_seeds_survives_a_restart(tmp_path):
         "seeds"
     }  # --numbers: neither weights nor figures
     seeds = {path.stem: json.loads(path.read_text()) for path in (tmp_path / "results/tiny/seeds").glob("*.json")}
-    assert {name: metrics["total_updates"] for name, metrics in seeds.items()} == {"1": 300, "2": 300}
+    assert {name: metrics["total_updates"] for name, metrics in seeds.items()} == {"1": 150, "2": 150}
     before = {path: path.stat().st_mtime_ns for path in tmp_path.glob("results/**/*")}
     third = start(tmp_path, lines)
     output, _ = third.communicate(timeout=60)
