@@ -936,7 +936,7 @@ def test_unknown_id(refuses, script, env_id):
     assert message.startswith(f"error: --env-id {env_id}: ") and all(known in message for known in script.ENV_IDS)
 
 
-SHIPPED = ["--eval-only", "--checkpoint", ROOT / "results" / "di" / "agent.safetensors"]
+FLOWN = ["--eval-only", "--checkpoint", ROOT / "results" / "di" / "agent.safetensors"]
 
 
 @pytest.mark.parametrize(
@@ -951,9 +951,9 @@ SHIPPED = ["--eval-only", "--checkpoint", ROOT / "results" / "di" / "agent.safet
         (["--eval-only"], "--checkpoint"),
         (["--eval-json", "a.json"], "--eval-json a.json: only with --eval-only"),
         (["--eval-npz", "a.npz"], "--eval-npz a.npz: only with --eval-only"),
-        ([*SHIPPED, "--eval-json", "."], "--eval-json .: only with --eval-only, and must be a file in an existing"),
-        ([*SHIPPED, "--eval-json=a.x", "--eval-npz=a.x"], "--eval-npz a.x: must be a file of its own"),
-        ([*SHIPPED, "--eval-json", SHIPPED[-1]], "agent.safetensors: must be a file of its own"),
+        ([*FLOWN, "--eval-json", "."], "--eval-json .: only with --eval-only, and must be a file in an existing"),
+        ([*FLOWN, "--eval-json=a.x", "--eval-npz=a.x"], "--eval-npz a.x: must be a file of its own"),
+        ([*FLOWN, "--eval-json", FLOWN[-1]], "agent.safetensors: must be a file of its own"),
     ],
     ids=lambda value: " ".join(map(str, value)) if isinstance(value, list) else "",
 )
