@@ -149,7 +149,7 @@ def learn_buffers(agent, averaged, args, batch):
     """Move `mean_flight` to the mean of an update's dispersed flights: at first all the way, then by a tenth."""
     if (args.dispersion or args.observe_draw) and not agent.mean_flight.any():
         new_inputs = len(DIFFERENCES) + batch.obs.shape[-1] - 9  # and the draw, all zeros on nominal flights
-        for network in (agent, averaged):  # what comes into sight changes nothing at first
+        for network in (agent, averaged):  # evaluation flies the averaged one; new inputs change nothing at first
             network.encoder[0].weight[:, -new_inputs:] = 0.0
     if not args.dispersion:
         return

@@ -53,6 +53,7 @@ def train(command, folder, updates):
 
 
 def bits(weight):
+    """All that makes two weights the same, NaN and the sign of zero included."""
     return weight.dtype, weight.shape, weight.numpy().tobytes()
 
 
