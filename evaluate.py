@@ -723,18 +723,20 @@ def publish(run_dir, folder, ship: bool = False, numbers: bool = False):
                 write_bytes(staged / file, (run_dir / file).read_bytes())
             redraw(staged)
             animate(staged)
-            for file in OF_ONE_POLICY:
-                (folder / file).unlink(missing_ok=True)
-        move(staged, folder, last)
+        move(staged, folder, last, replaced=OF_ONE_POLICY if ships else ())
 
 
 OF_ONE_POLICY = ("opponents.json", "figures/opponents.png", "figures/dispersed.png")  # another's would look current
 
 
-def move(staged, folder, last):
-    """Put every file of `staged` into a folder, one of them last."""
+def move(staged, folder, last, replaced):
+    """Put every file of `staged` into a folder, one of them last; before it goes what is `replaced` by none of them."""
     files = [path for path in staged.rglob("*") if path.is_file()]
     for path in sorted(files, key=lambda path: (path == last, path)):
+        if path == last:
+            for name in replaced:
+                if not (staged / name).exists():
+                    (folder / name).unlink(missing_ok=True)
         target = folder / path.relative_to(staged)
         target.parent.mkdir(parents=True, exist_ok=True)
         write_bytes(target, path.read_bytes())

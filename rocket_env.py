@@ -400,7 +400,7 @@ class RocketVectorEnv(BatchedEnv):
         return self.time.copy(), self.u.T.copy(), self.y.T.copy()
 
     def _make_sheet(self, animation):
-        return animation.Ascent(self.rocket)
+        return animation.Ascent(self.rocket, "Rocket ascent" + ", nominal stagings marked" * (self.dispersion > 0))
 
 
 def reachable(rocket: Rocket, dispersion: float = 0.0) -> tuple[float, float]:
@@ -432,7 +432,9 @@ class RocketEnv(SingleEnv):
     guidance = of_batch("guidance", "The reference pitch of R_guidance, a key of REFERENCE_PITCH.")
     end_time = of_batch("end_time", "Seconds after which an episode ends at the latest.")
     terminal_scale = of_batch("terminal_scale", "The scale of R_terminal in the reward; reports keep TERMINAL_SCALE.")
-    draw = of_batch("draw", "The running episode's standard scores (1, k), zeros without dispersion.")
+    draw = property(
+        lambda self: self.batch.draw, doc="The running episode's standard scores (1, k), zeros without dispersion."
+    )
 
 
 def flown_mission(mission: Mission, rocket: Rocket | None = None, table_isp: bool = False) -> Mission:

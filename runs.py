@@ -31,6 +31,7 @@ import tyro
 
 import evaluate
 from baselines import NoOptimum
+from envs import PROBLEMS
 
 gc.freeze()  # what was imported is never garbage; looking through it took a fifth of the time of --help
 
@@ -113,6 +114,8 @@ def parse_args(kind, argv, env_options, buffers):
         refuse("checkpoint", None, "must name the agent.safetensors that --eval-only flies")
     check(args, typed, env_ids)
     check_buffers(args, buffers[args.env_id])
+    if args.eval_only and saved["progress"]["seed"] == args.eval_seed and args.env_id in PROBLEMS:
+        print(f"--eval-seed {args.eval_seed} is the training's --seed: it may have flown these starts")
     if args.gae_lambda_final is None:
         args.gae_lambda_final = args.gae_lambda
     if args.eval_starts is None:
@@ -156,6 +159,8 @@ def check(args, typed, env_ids):
             refuse(name, value, f"must be one of {', '.join(choices[name])}")
     if args.embed_dim % args.num_heads:
         refuse("num_heads", args.num_heads, f"must divide --embed-dim {args.embed_dim}")
+    if "flights_per_start" in typed and args.refine_from is None and type(args)().flights_per_start == 1:
+        print(f"--flights-per-start {args.flights_per_start}: of the refinement alone, which --refine-from begins")
     check_outputs(args)
     if args.track and importlib.util.find_spec("wandb") is None:
         refuse("track", "", "needs wandb: pip install wandb")
@@ -313,8 +318,8 @@ class Run:
     """One run: `with run:` opens its folder and keeps what was learned whatever ends the training, `end_update` counts,
     saves, evaluates and logs, `finish` makes the reported evaluation. Under torchrun only the first process writes.
 
-    `progress` holds the counters; `training_seconds` are those of rollouts and updates, `wall_seconds` all until the
-    end of the last update: evaluations and saves, too.
+    `progress` holds the counters; `training_seconds` are those of rollouts and updates, `wall_seconds` all: evaluations
+    and saves, too, in eval.json the reported evaluation as well.
     """
 
     def __init__(self, args, saved, agent, average, optimizer, envs, env_options, describe):
@@ -351,7 +356,8 @@ class Run:
         for leftover in self.folder.glob(".*.tmp"):  # of a writer that was killed
             leftover.unlink()
         arguments = {**asdict(self.args), "resume": None}
-        evaluate.write_json(self.folder / "args.json", arguments)
+        if self.args.save_model:
+            evaluate.write_json(self.folder / "args.json", arguments)
         if self.args.track:
             track(self.args, self.folder.name)
         self.writer = new_writer(self.folder, self.progress["global_step"] + 1, arguments)
@@ -453,6 +459,7 @@ class Run:
             evaluate.write(metrics, arrays, args.checkpoint, args.eval_json, args.eval_npz)
             print(evaluate.table(metrics))
             return
+        metrics["wall_seconds"] = time.time() - self.began
         self.log("eval", metrics)
         self.writer.close()
         if args.save_model:

@@ -10,8 +10,8 @@ Each line of jobs.txt is a results folder and the command that trains for it; em
 With --numbers the results folders get the evaluations and curves alone: no weights, no figures.
 
 A run in runs/ belongs to a line if it has the same arguments, so nothing else is kept: start it again after a power
-cut and it does the rest. Each run's output is added to runs/<its name>.log. Exit status 1 if a run failed or could not
-be published; the others go on.
+cut and it does the rest. Each run's output is added to a log in runs/, named after its folder and seed. Exit status 1
+if a run failed or could not be published; the others go on. Ctrl-C and SIGTERM end the runs, too, which are saved.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ import functools
 import importlib
 import json
 import shlex
+import signal
 import subprocess
 import sys
 import time
@@ -62,7 +63,7 @@ class Job:
         if run is not None and (run / "training_state.pt").exists():
             flags = ["--resume", str(run), "--num-threads", str(self.args["num_threads"])]
         Path("runs").mkdir(exist_ok=True)
-        with open(f"runs/{self.results.name}_seed_{self.args['seed']}.log", "a") as log:
+        with open(f"runs/{'_'.join(self.results.parts[-2:])}_seed_{self.args['seed']}.log", "a") as log:
             return subprocess.Popen([sys.executable, ROOT / script, *flags], stdout=log, stderr=subprocess.STDOUT)
 
     def publish(self, numbers):
@@ -172,6 +173,8 @@ def work(jobs, at_once, numbers):
 
 
 def main():
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell ignores it for what it starts in the background
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that `work` ends what it has started
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("jobs", help="file with one run a line")
     parser.add_argument("--at-once", type=int, default=1, help="number of runs at a time")

@@ -75,7 +75,7 @@ def test_animate_writes_a_gif(result, tmp_path, monkeypatch, capsys):
         assert pixels_like(frames[-1], colour) > pixels_like(frames[0], colour)
 
 
-@pytest.mark.parametrize("result", ["rocket_cutoff", "di", "vdp_waypoints"])
+@pytest.mark.parametrize("result", ["rocket_cutoff", "di", "vdp", "vdp_waypoints"])
 def test_shipped_gifs_are_small_and_short(result):
     path = ROOT / "results" / result / "figures" / "animation.gif"
     frames, durations = frames_of(path)

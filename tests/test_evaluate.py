@@ -561,6 +561,14 @@ def test_shipping_another_seed_replaces_all_or_nothing(tmp_path, monkeypatch, ca
     for function, name in (("redraw", "training.png"), ("animate", "animation.gif")):
         monkeypatch.setattr(evaluate, function, draw(name))
     (results / "opponents.json").write_text("of seed 1")
+    with monkeypatch.context() as patch:
+        write = evaluate.write_bytes
+        patch.setattr(
+            evaluate, "write_bytes", lambda path, data: (full_disk if results in path.parents else write)(path, data)
+        )
+        with pytest.raises(SystemExit, match="No space left"):
+            command_line(monkeypatch, capsys, "publish", second, results, "--ship")
+    assert (results / "opponents.json").exists()
     command_line(monkeypatch, capsys, "publish", second, results, "--ship")
     assert not (results / "opponents.json").exists()
     for name in ("agent.safetensors", "figures/training.png", "figures/animation.gif"):
