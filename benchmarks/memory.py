@@ -121,10 +121,10 @@ def read(folder, experiment):
 
 
 def cell(values):
-    """Median and range of the seeds' values, to four significant figures."""
+    """Median and range of the seeds' values, to five significant figures."""
     if not values:
         return "-"
-    low, middle, high = (f"{value:.4g}" for value in (min(values), np.median(values), max(values)))
+    low, middle, high = (f"{value:.5g}" for value in (min(values), np.median(values), max(values)))
     return middle if len(values) == 1 else f"{middle} ({low} to {high})"
 
 
