@@ -140,9 +140,9 @@ def tvlqr(env_id: str, by_energy: bool = False, steering_weight: float = STEERIN
 
     By time the cut-off is met by holding the last direction, and the last whole step's gain, from the optimum's end on.
     By energy, which grows all through the last burn, a flight is compared with the optimum's state of its own energy:
-    the last gain then comes with the cut-off, whenever that is. R and tilt were chosen on 341 draws of eval seed 1, others than the reported:
-    median ||error|| by time and by energy 2.5e-5 and 1.8e-5 with R = 1e-7, 1.7e-5 and 1.4e-5 with 1e-8, 1.9e-5 and
-    1.3e-5, at a greater p95, with 1e-9; with a tilt of 0.3 rad the same.
+    the last gain then comes with the cut-off, whenever that is. R and tilt were chosen on 341 draws of eval seed 1,
+    others than the reported: median ||error|| by time and by energy 2.5e-5 and 1.8e-5 with R = 1e-7, 1.7e-5 and 1.4e-5
+    with 1e-8, 1.9e-5 and 1.3e-5, at a greater p95, with 1e-9; with a tilt of 0.3 rad the same.
     """
     mission, flight = envs.ROCKETS[env_id], nominal_optimum(env_id)
     (gains, axes), y, u = lqr_gains(mission, flight, steering_weight), flight["y"], flight["u"]
