@@ -114,7 +114,7 @@ def parse_args(kind, argv, env_options, buffers):
         refuse("checkpoint", None, "must name the agent.safetensors that --eval-only flies")
     check(args, typed, env_ids)
     check_buffers(args, buffers[args.env_id])
-    if args.eval_only and saved["progress"]["seed"] == args.eval_seed and args.env_id in PROBLEMS:
+    if args.eval_only and saved and saved["progress"]["seed"] == args.eval_seed and args.env_id in PROBLEMS:
         print(f"--eval-seed {args.eval_seed} is the training's --seed: it may have flown these starts")
     if args.gae_lambda_final is None:
         args.gae_lambda_final = args.gae_lambda
@@ -318,8 +318,8 @@ class Run:
     """One run: `with run:` opens its folder and keeps what was learned whatever ends the training, `end_update` counts,
     saves, evaluates and logs, `finish` makes the reported evaluation. Under torchrun only the first process writes.
 
-    `progress` holds the counters; `training_seconds` are those of rollouts and updates, `wall_seconds` all: evaluations
-    and saves, too, in eval.json the reported evaluation as well.
+    `progress` holds the counters; `training_seconds` are those of rollouts and updates, `wall_seconds` all until the
+    end of the last rollout and update: the evaluations and saves before it, too.
     """
 
     def __init__(self, args, saved, agent, average, optimizer, envs, env_options, describe):
@@ -459,7 +459,6 @@ class Run:
             evaluate.write(metrics, arrays, args.checkpoint, args.eval_json, args.eval_npz)
             print(evaluate.table(metrics))
             return
-        metrics["wall_seconds"] = time.time() - self.began
         self.log("eval", metrics)
         self.writer.close()
         if args.save_model:
