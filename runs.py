@@ -159,7 +159,7 @@ def check(args, typed, env_ids):
             refuse(name, value, f"must be one of {', '.join(choices[name])}")
     if args.embed_dim % args.num_heads:
         refuse("num_heads", args.num_heads, f"must divide --embed-dim {args.embed_dim}")
-    if "flights_per_start" in typed and args.refine_from is None and type(args)().flights_per_start == 1:
+    if args.flights_per_start > 1 and args.refine_from is None and type(args)().flights_per_start == 1:
         print(f"--flights-per-start {args.flights_per_start}: of the refinement alone, which --refine-from begins")
     check_outputs(args)
     if args.track and importlib.util.find_spec("wandb") is None:

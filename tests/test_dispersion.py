@@ -684,6 +684,8 @@ def test_a_crash_is_charged_the_flights_own_propellant():
 def test_dispersed_flights_are_drawn():
     env = gym.make(CUTOFF, dispersion=1, render_mode="rgb_array")
     env.reset(seed=0)
+    with pytest.raises(AttributeError):
+        env.unwrapped.draw = np.zeros((1, 16))  # would rename the vehicle that flies, and not change it
     env.step(np.array([1.0, 0.0, 0.3]))
     frame = env.render()
     assert frame.ndim == 3 and frame.dtype == np.uint8 and frame.std() > 0

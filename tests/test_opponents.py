@@ -132,6 +132,14 @@ def test_a_late_flight_is_steered_as_gently_as_the_one_before(env_id, by_energy)
     assert turn(last, last + 3) < 3 * turn(last - 2, last - 2) < 0.05
 
 
+@pytest.mark.parametrize("env_id", [CUTOFF, LEO])
+def test_plans_have_directions_until_the_last_vehicle_burns_out(env_id):
+    """The 1705 draws of eval seed 0: some burn longer than the nominal vehicle may."""
+    rocket = ROCKETS[env_id].rocket
+    burn_out = envs.draw_vehicles(rocket, 1.0, evaluate.draws(rocket, 1.0, 0, 1705)).burn_out.max()
+    assert rocket.end_time < burn_out < opponents.middles(rocket)[-1]
+
+
 # --- what solves ------------------------------------------------------------------------------------------------------
 
 

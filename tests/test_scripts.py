@@ -406,6 +406,17 @@ def test_no_save_model_writes_events_only(tmp_path, monkeypatch):
     assert "eval/ratio_of_sums" in scalars(run_folder())
 
 
+def test_flags_that_do_not_do_what_they_seem_to_say_so(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    shipped = [f"--checkpoint={ROOT / 'results' / 'di' / 'agent.safetensors'}", "--eval-only", "--eval-starts=10"]
+    for seed, warned in ((1, True), (2, False)):  # it was trained with --seed 1
+        DI.main([*shipped, f"--eval-seed={seed}"])
+        assert ("it may have flown these starts" in capsys.readouterr().out) == warned
+    for flags, warned in (["--flights-per-start=2"], True), (["--flights-per-start=2", "--refine-from=0.5"], False):
+        runs.parse_args(DI.Args, ["--num-envs=4", *flags], DI.ENV_OPTIONS, DI.BUFFERS)
+        assert ("of the refinement alone" in capsys.readouterr().out) == warned
+
+
 def test_eval_only_defaults(trained, tmp_path, monkeypatch):
     """1000 starts; architecture and observation from the checkpoint; without a path nothing is written."""
     monkeypatch.chdir(tmp_path)
