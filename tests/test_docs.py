@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import baselines
 import envs
 import runs
 
@@ -140,3 +141,16 @@ def test_the_front_page_says_what_the_results_hold(result):
         for (_, *span), (values, digits, _) in zip(numbers, figures):
             assert not any(span) or span == [f"{end:.{digits}f}" for end in (min(values), max(values))]
     assert any(numbers_of(row["here"])[0][1:]) == (count > 1)  # as the last line below the table says
+
+
+def test_the_front_page_s_problem_is_solved(new_problem):
+    """Its table as printed: an environment of its own, and an optimum that hits both circles."""
+    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), flags=re.DOTALL)
+    names = {"Problem": envs.Problem, "Phase": envs.Phase}
+    exec(code, names)
+    env_id = new_problem(names["DUFFING"])
+    x0 = baselines.starts(0, 5, names["DUFFING"].x0_max)
+    assert baselines.reference(env_id, x0)["hit"].all()
+    x = envs.fly(env_id, lambda obs, t: np.zeros((5, 1)), x0)["x"]  # without control the damped spring loses energy
+    energy = x[..., 1] ** 2 / 2 - x[..., 0] ** 2 / 2 + x[..., 0] ** 4 / 4
+    assert (np.diff(energy, axis=1) < 0).all()
