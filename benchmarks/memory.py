@@ -36,7 +36,7 @@ class Experiment:
     """Runs that differ by their memory alone: what is asked, and the keys of eval.json that answer."""
 
     title: str
-    rows: dict[str, str]  # folder, from results/memory/<experiment> -> what is printed of it
+    rows: dict[str, str]  # folder in results/memory/<experiment> -> what is printed of it
     keys: dict[str, str]  # key of eval.json -> what is printed of it; the first is drawn
     log: bool = False  # the figure's axis
     bound: Callable | None = None  # what no memory can beat, of the keys of which that is known: () -> {key: value}
@@ -76,14 +76,14 @@ ROCKET_ROWS = {
 EXPERIMENTS = {
     "hidden_velocity": Experiment(
         "Double integrator, velocity hidden: cost over the optimum's, which sees it (ratio of sums)",
-        {**lengths(0, 1, 4, 32), "../../di": "L_mem 32, velocity shown"},
+        {**lengths(0, 1, 4, 32), "shown": "L_mem 32, velocity shown"},
         {"ratio_of_sums": "ratio of sums", "ratio_p95": "p95", "hit_rate": "hit the circle"},
         log=True,
         bound=velocity_from_the_second_step,
     ),
     "hidden_phase": Experiment(
         "Double integrator, two waypoints, time and phase hidden: share of the starts that hit both circles",
-        {**lengths(0, 8, 32, 100), "../../di_waypoints": "L_mem 32, both shown"},
+        {**lengths(0, 8, 32, 100), "shown": "L_mem 32, both shown"},
         {
             "hit_rate": "hit both",
             "hit_rate_phase_1": "circle 1",

@@ -24,17 +24,21 @@ def start(folder, lines):
     return subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
+def read_logs(folder):
+    return [path.read_text() for path in folder.glob("runs/results_tiny_seed_*.log")]
+
+
 @pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
 def test_run_seeds_survives_a_restart(tmp_path, signum):
     """Two seeds, interrupted once both train; the second start goes on with both, the third has nothing to do."""
     lines = [f"results/tiny ppo_gtrxl_di.py --seed {seed} --total-updates 150 {TINY}  # seed {seed}" for seed in (1, 2)]
     first = start(tmp_path, ["# two seeds", "", *lines])
-    while first.poll() is None and len(list(tmp_path.glob("runs/*/training_state.pt"))) < 2:
+    while first.poll() is None and sum("update 1/150" in log for log in read_logs(tmp_path)) < 2:
         time.sleep(0.02)
     first.send_signal(signum)
     first.communicate(timeout=60)
     assert first.returncode == 128 + signum and not list(tmp_path.glob("runs/*/eval.json"))
-    logs = [path.read_text() for path in tmp_path.glob("runs/results_tiny_seed_*.log")]
+    logs = read_logs(tmp_path)
     assert len(logs) == 2 and all("stopped after update" in log for log in logs), "what it started, it ended"
     second = start(tmp_path, lines)
     output, errors = second.communicate(timeout=120)
