@@ -76,14 +76,22 @@ ROCKET_ROWS = {
 EXPERIMENTS = {
     "hidden_velocity": Experiment(
         "Double integrator, velocity hidden: cost over the optimum's, which sees it (ratio of sums)",
-        {**lengths(0, 1, 4, 32), "shown": "L_mem 32, velocity shown"},
+        {
+            **lengths(0, 1, 4, 32),
+            "shown_memory_0": "L_mem 0, velocity shown",
+            "shown": "L_mem 32, velocity shown",
+        },
         {"ratio_of_sums": "ratio of sums", "ratio_p95": "p95", "hit_rate": "hit the circle"},
         log=True,
         bound=velocity_from_the_second_step,
     ),
     "hidden_phase": Experiment(
         "Double integrator, two waypoints, time and phase hidden: share of the starts that hit both circles",
-        {**lengths(0, 8, 32, 100), "shown": "L_mem 32, both shown"},
+        {
+            **lengths(0, 8, 32, 100),
+            "shown_memory_0": "L_mem 0, both shown",
+            "shown": "L_mem 32, both shown",
+        },
         {
             "hit_rate": "hit both",
             "hit_rate_phase_1": "circle 1",
