@@ -282,10 +282,10 @@ class Ascent(Sheet):
     def _prepare_events(self):
         """What is dropped at the end of each burn, unseen until it happens; the last is the end of the flight."""
         self.events = []
-        for burn in self.rocket.burns[:-1]:
+        for burn, dropped in zip(self.rocket.burns[:-1], self.rocket.dropped):
             number = sum(n for n, _ in burn.dropped)
             engines = f"{number} engine{'s' * (number != 1)}, " if number else ""
-            self.events.append((burn.end, f"{burn.end:.0f} s: {engines}{burn.jettison / 1e3:.1f} t dropped"))
+            self.events.append((burn.end, f"{burn.end:.0f} s: {engines}{dropped / 1e3:.1f} t dropped"))
         for time, _ in self.events:
             self.pitch.axvline(time, **BOUNDARY)
         self.marks = self.ascent.plot([], [], "o", color="k", markersize=4, zorder=8)[0]

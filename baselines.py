@@ -45,6 +45,7 @@ from rocket_baselines import (
     mission_ascent,
     nine_pitch_angles,
     optimise_ascent,
+    return_status,
     solve_ascent,
 )
 
@@ -276,7 +277,7 @@ def _solve_start(task):
     solutions, statuses = [], []
     for guess in guesses(env_id, x0):
         solution = solve(p=x0, x0=guess, **arguments)
-        statuses.append(solve.stats()["return_status"])
+        statuses.append(return_status(solve))
         multipliers = solution["lam_g"].full()[2 * T :, 0]
         solutions.append((solution["x"].full()[:T, 0], float(solution["f"]), multipliers))
     solved = [k for k, status in enumerate(statuses) if status == "Solve_Succeeded"]
@@ -605,6 +606,8 @@ def main() -> None:
         args.run(args)
     except (ImportError, OSError, RuntimeError) as error:
         sys.exit(f"error: {error}")
+    except KeyboardInterrupt:
+        sys.exit(130)
 
 
 if __name__ == "__main__":

@@ -220,6 +220,8 @@ class PhasedVectorEnv(BatchedEnv):
         self._context = np.hstack([np.vstack([seen, targets[-1]]), clock]) if len(phases) > 1 else clock[:, :1]
 
     def _start(self, mask, options):
+        if options.keys() - {"x0"}:
+            raise BadInput(f"reset options are {options!r}; the only one is 'x0'")
         count, bound = int(mask.sum()), self.problem.x0_max
         if "x0" in options:
             x0 = np.asarray(options["x0"], dtype=np.float64)

@@ -293,12 +293,7 @@ def read_checkpoint(
 
 def read_evaluation(folder: Path) -> tuple[dict, dict]:
     """The `metrics` and `arrays` of a run's or results folder; OSError or ValueError names the file that is bad."""
-    metrics = read_json(folder / "eval.json")
-    try:
-        table(metrics)
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{folder / 'eval.json'} lacks a number of its table, or has a wrong one: {error}") from error
-    path = folder / "eval.npz"
+    metrics, path = read_metrics(folder / "eval.json"), folder / "eval.npz"
     try:
         with np.load(path) as file:
             arrays = {key: file[key] for key in file.files}
@@ -311,6 +306,16 @@ def read_evaluation(folder: Path) -> tuple[dict, dict]:
     if missing := needed - arrays.keys():
         raise ValueError(f"{path} lacks {', '.join(sorted(missing))}")
     return metrics, arrays
+
+
+def read_metrics(path: Path) -> dict:
+    """An eval.json that holds all of its table; ValueError names the file and what is wrong with it."""
+    metrics = read_json(path)
+    try:
+        table(metrics)
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path} lacks a number of its table, or has a wrong one: {error}") from error
+    return metrics
 
 
 def read_json(path: Path) -> dict:
@@ -362,12 +367,15 @@ def read_csv(path) -> dict:
     """The curve that `write_csv` wrote; ValueError if the file is not such a table."""
     with open(path, newline="") as file:
         header, *rows = list(csv.reader(file)) or [[]]
-    if header[:1] != ["global_step"] or any(len(row) != len(header) for row in rows):
-        raise ValueError(f"{path} is not a training curve: global_step, then one column a TensorBoard tag")
-    curve = {}
-    for column, tag in enumerate(header[1:], start=1):
-        filled = [row for row in rows if row[column]]
-        curve[tag] = np.array([int(row[0]) for row in filled]), np.array([float(row[column]) for row in filled])
+    try:
+        if header[:1] != ["global_step"] or not rows or any(len(row) != len(header) for row in rows):
+            raise ValueError("global_step, then one column a TensorBoard tag, and a row")
+        curve = {}
+        for column, tag in enumerate(header[1:], start=1):
+            filled = [row for row in rows if row[column]]
+            curve[tag] = np.array([int(row[0]) for row in filled]), np.array([float(row[column]) for row in filled])
+    except ValueError as error:
+        raise ValueError(f"{path} is not a training curve: {error}") from error
     return curve
 
 
@@ -676,7 +684,8 @@ def dispersed_lines(metrics: dict) -> list[str]:
             mean, std = (metrics[f"dispersed_{name}_error_{part}_{unit}"] for part in ("mean", "std"))
             digits = 2 if unit == "km" else 4
             spreads.append(f"{name} {mean:+.{digits}f} ± {std:.{digits}f} {unit} (box ± {half:g})")
-    lines.append(f"    off the target, mean ± standard deviation: {', '.join(spreads)}")
+    if spreads:  # of those that reached an orbit
+        lines.append(f"    off the target, mean ± standard deviation: {', '.join(spreads)}")
     rate, low, high = (metrics[f"dispersed_box_{part}"] for part in ("rate", "low", "high"))
     lines.append(f"    inside the box in all of them {rate:.2%} (95 %: {low:.2%} to {high:.2%})")
     mass = f"final mass {metrics['dispersed_mass_mean_kg']:.2f} kg on average, 1 % below"
@@ -693,7 +702,8 @@ def publish(run_dir, folder, ship: bool = False, numbers: bool = False):
     """Add a run to a results folder: its eval.json and training curve under seeds/, and the policy if it is shipped.
 
     The policy, its evaluation and the figures are replaced only where the folder ships none or with `ship`; with
-    `numbers` the folder holds seeds/ alone. OSError or ValueError says what is missing or does not fit; nothing has
+    `numbers` the folder holds seeds/ alone. Of a small problem it keeps the flights of the first 100 starts; its
+    figures are drawn of all. OSError or ValueError says what is missing or does not fit; nothing has
     been written then. All is drawn before, and seeds/<seed>.json is written last: where it is, the rest is, too.
     """
     run_dir, folder = Path(run_dir), Path(folder)
@@ -704,9 +714,10 @@ def publish(run_dir, folder, ship: bool = False, numbers: bool = False):
     curve = read_curve(run_dir)
     if not curve:
         raise ValueError(f"{run_dir} has no TensorBoard scalars")
-    shipped = read_json(folder / "eval.json") if (folder / "eval.json").exists() else None
-    if shipped and shipped["env_id"] != metrics["env_id"]:
-        raise ValueError(f"{run_dir} is of {metrics['env_id']}, {folder} of {shipped['env_id']}")
+    shipped = read_metrics(folder / "eval.json") if (folder / "eval.json").exists() else None
+    for path in [*folder.glob("eval.json"), *(folder / "seeds").glob("*.json")]:
+        if (other := read_json(path)["env_id"]) != metrics["env_id"]:
+            raise ValueError(f"{run_dir} is of {metrics['env_id']}, {path} of {other}")
     if shipped and not ship and shipped["seed"] == metrics["seed"]:
         raise ValueError(f"{folder} already ships seed {metrics['seed']}; --ship replaces it")
     seed, ships = metrics["seed"], (ship or not shipped) and not numbers
@@ -723,7 +734,20 @@ def publish(run_dir, folder, ship: bool = False, numbers: bool = False):
                 write_bytes(staged / file, (run_dir / file).read_bytes())
             redraw(staged)
             animate(staged)
+            if metrics["env_id"] in envs.PROBLEMS:
+                keep_first_starts(staged / "eval.npz")
         move(staged, folder, last, replaced=OF_ONE_POLICY if ships else ())
+
+
+KEPT_STARTS = 100  # of a small problem in a results folder
+
+
+def keep_first_starts(path):
+    """Cut an eval.npz of a small problem to the first `KEPT_STARTS`; all of its arrays but the times are by start."""
+    with np.load(path) as file:
+        arrays = {key: file[key] for key in file.files}
+    if len(arrays["x"]) > KEPT_STARTS:
+        write_npz(path, {key: array if key == "t" else array[:KEPT_STARTS] for key, array in arrays.items()})
 
 
 OF_ONE_POLICY = ("opponents.json", "figures/opponents.png", "figures/dispersed.png")  # another's would look current
@@ -773,7 +797,7 @@ SEED_ROWS = {  # key of eval.json -> its row in the table of a folder's seeds
     "perigee_km": ("perigee (km)", ".2f"),
     "apogee_km": ("apogee (km)", ".2f"),
     "max_altitude_km": ("highest (km)", ".1f"),
-    "min_altitude_after_300s_km": ("lowest after 300 s (km)", ".1f"),
+    "min_altitude": ("lowest, late in the ascent (km)", ".1f"),  # in eval.json its key names the seconds: `lowest_key`
     "final_mass_kg": ("final mass (kg)", ".2f"),
     "mass_ratio": ("mass / optimum's", ".4f"),
     "mass_ratio_reached": ("mass / optimum's for the orbit reached", ".4f"),
@@ -789,9 +813,12 @@ SEED_ROWS = {  # key of eval.json -> its row in the table of a folder's seeds
 
 def seed_lines(folder) -> list[str]:
     """A table of a results folder's seeds with their medians and ranges, a row each figure; none for one seed."""
-    runs = sorted((read_json(path) for path in (Path(folder) / "seeds").glob("*.json")), key=lambda run: run["seed"])
+    runs = sorted((read_metrics(path) for path in (Path(folder) / "seeds").glob("*.json")), key=lambda run: run["seed"])
     if len(runs) < 2:
         return []
+    for run in runs:
+        if run["env_id"] in envs.ROCKETS and (key := lowest_key(envs.ROCKETS[run["env_id"]])) in run:
+            run["min_altitude"] = run[key]
     heads = [*(f"seed {run['seed']}" for run in runs), "median", "lowest", "highest"]
     lines = [f"{'':40}" + "".join(f"{head:>10}" for head in heads)]
     for key, (label, form) in SEED_ROWS.items():

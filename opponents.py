@@ -32,6 +32,7 @@ from rocket_baselines import (
     collocation,
     interpolate,
     orbit_defect,
+    return_status,
     rocket_reference,
     state_scale,
 )
@@ -251,7 +252,7 @@ def optimise_rest(rocket: Rocket, rest: Rest, guess: dict, intervals: tuple[int,
     bounds = {"lbx": np.append(-box, 0.0), "ubx": np.append(box, rest.end[-1] - ignition)}
     bounds |= {"lbg": np.append(equal, radius), "ubg": np.append(equal, np.full(n, np.inf))}
     solution = solve(x0=w, p=rest_parameters(rocket, rest, intervals), **bounds)
-    status = solve.stats()["return_status"]
+    status = return_status(solve)
     if status != "Solve_Succeeded":
         raise NoOptimum(f"the rest of an ascent from {rest.begin} s: IPOPT stopped with {status}")
     w = solution["x"].full()[:, 0]

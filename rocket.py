@@ -26,13 +26,17 @@ def refuse_unless(possible, field: str, value, allowed: str):
         raise BadInput(f"{field} is {value}; it {allowed}")
 
 
+def is_finite(value) -> bool:
+    """Whether it is a number, and not infinite."""
+    return isinstance(value, int | float | np.number) and bool(np.isfinite(value))
+
+
 def refuse_unless_finite(whose: str, table):
     """BadInput for the first number of a dataclass that is not one, or is infinite."""
     for field in fields(table):
         value = getattr(table, field.name)
         if field.type == "float":
-            number = isinstance(value, int | float | np.number) and np.isfinite(value)
-            refuse_unless(number, f"{whose} {field.name}", value, "must be a finite number")
+            refuse_unless(is_finite(value), f"{whose} {field.name}", value, "must be a finite number")
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -68,7 +72,7 @@ class Engine:
 
 @dataclass(frozen=True)
 class Burn:
-    """A phase: the engines that burn until `end` and those whose dry mass is dropped then, as (number, engine)."""
+    """A phase: the engines that burn until `end` and those that are dropped then, as (number, engine)."""
 
     end: float  # s
     engines: tuple[tuple[int, Engine], ...]
@@ -78,9 +82,11 @@ class Burn:
         for name in ("engines", "dropped"):
             parts = getattr(self, name)
             pairs = isinstance(parts, tuple) and all(isinstance(part, tuple) and len(part) == 2 for part in parts)
-            pairs = pairs and all(isinstance(engine, Engine) for _, engine in parts)
+            pairs = pairs and all(is_finite(n) and isinstance(engine, Engine) for n, engine in parts)
             allowed = "must be a tuple of (number, engine), as in ((1, STAGE_1),)"
             refuse_unless(pairs, f"a burn's {name}", f"{parts!r:.60}", allowed)
+        number = isinstance(self.end, int | float | np.number)
+        refuse_unless(number, "a burn's end", repr(self.end), "must be a number of seconds")
 
     @property
     def thrust(self) -> float:
@@ -90,11 +96,6 @@ class Burn:
     def flow(self, table_isp: bool) -> float:
         """kg/s."""
         return sum(n * engine.flow(table_isp) for n, engine in self.engines)
-
-    @property
-    def jettison(self) -> float:
-        """kg; propellant that did not burn stays on board."""
-        return sum(n * (engine.total_mass - engine.propellant) for n, engine in self.dropped)
 
 
 class OrbitalElements(NamedTuple):
@@ -184,15 +185,38 @@ class Rocket:
         A last stage that runs dry before its phase ends gives an arc of its own without thrust.
         """
         arcs, start = [], 0.0
-        for burn in self.burns:
+        for burn, dropped in zip(self.burns, self.dropped):
             flow = burn.flow(self.table_isp)
-            dry = start + sum(n * engine.propellant for n, engine in burn.engines) / flow if flow else np.inf  # a coast
+            dry = start + self.last_propellant / flow if flow else np.inf  # a coast
             if burn is self.burns[-1] and dry < burn.end - 1e-6:  # rounding alone is not an event
                 arcs.append((start, dry, burn.thrust, flow, 0.0))
                 start, flow = dry, 0.0
-            arcs.append((start, burn.end, burn.thrust if flow else 0.0, flow, burn.jettison))
+            arcs.append((start, burn.end, burn.thrust if flow else 0.0, flow, dropped))
             start = burn.end
         return arcs
+
+    @property
+    def dropped(self) -> list[float]:
+        """kg that leave at the end of each burn: dry mass, and the propellant that the dropped engines have not burnt.
+
+        With `table_isp` that propellant stays on board: so the paper's table, which contradicts itself, is flown.
+        """
+        dry = lambda parts: sum(n * (engine.total_mass - engine.propellant) for n, engine in parts)  # noqa: E731
+        dropped = [float(dry(burn.dropped)) for burn in self.burns]
+        for number, engine, _, k, _, part, full in engine_groups(self):
+            if k < len(self.burns) - 1 and part < full * (1 - 1e-9) and not self.table_isp:
+                dropped[k] += number * (engine.propellant - engine.flow(False) * part)
+        return dropped
+
+    @property
+    def last_propellant(self) -> float:
+        """kg in the last burn's engines when it begins: all, less what they burnt in earlier burns."""
+        seconds = self.burns[-1].end - self.last_ignition
+        groups = [group for group in engine_groups(self) if group.dropped == len(self.burns) - 1]
+        return sum(
+            group.number * (group.engine.propellant - group.engine.flow(self.table_isp) * (group.part - seconds))
+            for group in groups
+        )
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -230,6 +254,8 @@ def check_burns(rocket: Rocket):
     refuse_unless(rocket.burns, "a rocket's burns", rocket.burns, "must hold at least one burn")
     start, used = 0.0, {}
     for k, burn in enumerate(rocket.burns):
+        refuse_unless(isinstance(burn, Burn), f"burns[{k}]", f"{burn!r:.60}", "must be a Burn")
+    for k, burn in enumerate(rocket.burns):
         refuse_unless(
             start < burn.end < np.inf, f"burns[{k}].end", burn.end, f"must be finite and later than {start} s"
         )
@@ -242,6 +268,8 @@ def check_burns(rocket: Rocket):
             allowed = f"must be positive and at most {has}: so many are dropped then or later, or are of the last burn"
             refuse_unless(0 < number <= has, field, number, allowed)
             used[engine] = used.get(engine, 0.0) + number * engine.flow(rocket.table_isp) * (burn.end - start)
+        for number, _ in burn.dropped:
+            refuse_unless(number > 0, f"the number of an engine in burns[{k}].dropped", number, "must be positive")
         start = burn.end
     last, allowed = rocket.burns[-1].dropped, "must be empty: the last burn's engines stay aboard"
     refuse_unless(not last, f"burns[{k}].dropped", f"{last!r:.60}", allowed)
@@ -284,8 +312,7 @@ class Mission:
     def __post_init__(self):
         for name in ("ceiling_km", "floor_km", "late", "guided_until", "mass_unit"):
             value = getattr(self, name)
-            number = isinstance(value, int | float | np.number) and np.isfinite(value)
-            optional = name not in ("floor_km", "late")
+            number, optional = is_finite(value), name not in ("floor_km", "late")
             allowed = "must be positive and finite, or None" if optional else "must be a finite number"
             possible = value is None or (number and value > 0) if optional else number
             refuse_unless(possible, f"a mission's {name}", value, allowed)
@@ -525,6 +552,23 @@ def nominal_vehicles(rocket: Rocket, number: int) -> Vehicles:
     numbers = [rocket.x0[6], rocket.dry_mass, sum(n * engine.propellant for n, engine in rocket.burns[-1].engines)]
     columns = [*numbers, np.append(end[:-1], np.inf), thrust, flow, dropped, rocket.burns[-1].end, np.zeros(2), 1.0]
     return Vehicles(*(np.repeat(np.asarray(column)[..., None], number, axis=-1) for column in columns))
+
+
+def check_drawable(rocket: Rocket):
+    """BadInput where no flights can be drawn of a rocket: with all scores 0 it has to be the nominal one.
+
+    Drawn engines burn each from a tank of its own, and those that are dropped together burn together.
+    """
+    drawn = draw_vehicles(rocket, 1.0, np.zeros((1, len(draw_names(rocket)))))
+    ends, dropped = [burn.end for burn in rocket.burns], rocket.dropped
+    for k in range(len(rocket.burns) - 1):
+        allowed = f"cannot be drawn: its engines, each from its own tank, burn until {drawn.end[k, 0]:.6g} s"
+        refuse_unless(np.isclose(ends[k], drawn.end[k, 0]), f"burns[{k}].end", ends[k], allowed)
+        kept = rocket.table_isp  # propellant that a drawn flight drops
+        allowed = f"cannot be drawn: what has not burnt then makes it {drawn.dropped[k, 0]:.6g} kg"
+        refuse_unless(
+            kept or np.isclose(dropped[k], drawn.dropped[k, 0]), f"what burns[{k}] drops", f"{dropped[k]} kg", allowed
+        )
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -190,6 +190,14 @@ def interpolate(times, t, values):
     return np.column_stack([np.interp(times, t, column) for column in values.T])
 
 
+def return_status(solve) -> str:
+    """How IPOPT ended; KeyboardInterrupt where a signal did it, which CasADi would pass over as one more failure."""
+    status = solve.stats()["return_status"]
+    if status == "NonIpopt_Exception_Thrown":
+        raise KeyboardInterrupt
+    return status
+
+
 def ascend(case: Ascent, mesh: Mesh, guess: dict) -> dict:
     """Solve `ascent_program` from a guess with t (s), y (its states, at least r and v), t_u (s), u (directions).
 
@@ -212,7 +220,7 @@ def ascend(case: Ascent, mesh: Mesh, guess: dict) -> dict:
     low, high = (np.append(equal, np.full(n, 1 + h / rocket.Re)) for h in (case.floor, case.ceiling))
     lbx, ubx = np.append(-box, mesh.final_time[0]), np.append(box, mesh.final_time[1])
     solution = solve(x0=start, lbx=lbx, ubx=ubx, lbg=low, ubg=high)
-    status = solve.stats()["return_status"]
+    status = return_status(solve)
     if status != "Solve_Succeeded":
         raise NoOptimum(f"rocket ascent {case.key}: IPOPT stopped with {status}")
     w, end = solution["x"].full()[:-1, 0], float(solution["x"][-1])

@@ -25,6 +25,7 @@ from rocket import (
     Mission,
     Rocket,
     ascent,
+    check_drawable,
     delta_v,
     draw_bounds,
     draw_names,
@@ -103,6 +104,8 @@ class RocketVectorEnv(BatchedEnv):
         number = isinstance(dispersion, int | float | np.number) and 0 <= dispersion <= LARGEST_DISPERSION
         refuse_unless(number, "dispersion", dispersion, f"must be a number from 0 to {LARGEST_DISPERSION:.0f}")
         self.mission = flown_mission(mission, table_isp=table_isp)
+        if dispersion:
+            check_drawable(self.mission.rocket)
         self.rocket, self.cutoff = self.mission.rocket, mission.cutoff
         self._last_phase = len(self.rocket.burns) - 1
         self.action_frame, self.observe_phase = action_frame, observe_phase

@@ -65,7 +65,8 @@ def fail(message) -> NoReturn:
 
 def refuse(name, value, allowed) -> NoReturn:
     """End with one line that names a field of Args as its flag, its value and what is allowed."""
-    fail(f"--{name.replace('_', '-')} {value}: {allowed}")
+    flag = f"--{name.replace('_', '-')} {value}".strip()
+    fail(f"{flag}: {allowed}")
 
 
 def read_flags(kind, argv):
@@ -162,6 +163,10 @@ def check(args, typed, env_ids):
     if args.flights_per_start > 1 and args.refine_from is None and type(args)().flights_per_start == 1:
         print(f"--flights-per-start {args.flights_per_start}: of the refinement alone, which --refine-from begins")
     check_outputs(args)
+    if Path(args.exp_name).name != args.exp_name:
+        refuse("exp_name", args.exp_name, "must be the name of a folder, without /")
+    if getattr(args, "dispersion", 0.0) and not (args.observe_phase or args.eval_only):
+        refuse("no_observe_phase", "", "not in a training with --dispersion: the mean flight is found by the time")
     if args.track and importlib.util.find_spec("wandb") is None:
         refuse("track", "", "needs wandb: pip install wandb")
     check_share(args, typed)
@@ -236,18 +241,20 @@ def check_share(args, typed):
 
 def start(main):
     """Run a script's `main(argv)`: Ctrl-C and SIGTERM end it with status 130 and 143, bad input with one line and 1."""
+    status = [128 + signal.SIGINT]
 
     def interrupt(signum, _):
-        raise KeyboardInterrupt(128 + signum)
+        status[0] = 128 + signum
+        raise KeyboardInterrupt
 
     for signum in (signal.SIGINT, signal.SIGTERM):
         signal.signal(signum, interrupt)
     try:
         main(sys.argv[1:])
-    except (evaluate.BadInput, NoOptimum, OSError) as error:
+    except (evaluate.BadInput, NoOptimum, ImportError, OSError) as error:
         fail(error)
-    except KeyboardInterrupt as error:
-        sys.exit(*error.args)
+    except KeyboardInterrupt:
+        sys.exit(status[0])
 
 
 def prepare_torch(args):
@@ -521,6 +528,10 @@ def training_state(args, modules, envs, progress):
 def restore(state, run_dir, modules, envs):
     """Put everything back where `training_state` found it; returns the progress. One line if something does not fit."""
     try:
+        for name, constant in modules["agent"].named_buffers():
+            learnt = not constant.any()  # zeros in a new agent
+            if not learnt and not torch.allclose(constant.cpu(), state["agent"][name], rtol=1e-6):
+                raise ValueError(f"{name} is not that of {state['args']['env_id']} now")
         for name, module in modules.items():
             module.load_state_dict(state[name])
         if len(state["rng"]) != process()[1]:
@@ -532,7 +543,8 @@ def restore(state, run_dir, modules, envs):
         counters = ("seed", "total_updates", "global_step", "training_seconds", "wall_seconds")
         return {name: state["progress"][name] for name in counters}
     except Exception as error:  # an edited file fails in many ways, all alike to the user
-        fail(f"--resume {run_dir}: its training_state.pt does not fit its own args ({error}); it must be whole")
+        allowed = "must be whole, and of the script and vehicle as they are"
+        fail(f"--resume {run_dir}: its training_state.pt does not fit ({error}); {allowed}")
 
 
 def load_state(run_dir, kind, env_ids):
@@ -592,12 +604,11 @@ def keep_memory():
 
 
 def join_processes(cuda):
-    """Under torchrun, which sets RANK, become one of its processes, each with its own GPU if there are; `process`."""
+    """Under torchrun, which sets RANK, become one of its processes, each with its own GPU if there are."""
     if "RANK" in os.environ and not dist.is_initialized():
         if gpu := torch.cuda.is_available() and cuda:
             torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
         dist.init_process_group("nccl" if gpu else "gloo")
-    return process()
 
 
 def process():

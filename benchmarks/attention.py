@@ -12,7 +12,6 @@ what it was before training.
 
 from __future__ import annotations
 
-import argparse
 import importlib
 import sys
 from pathlib import Path
@@ -23,6 +22,7 @@ from matplotlib.figure import Figure
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
+import baselines  # noqa: E402
 import envs  # noqa: E402
 import evaluate  # noqa: E402
 import figures  # noqa: E402
@@ -165,10 +165,10 @@ def gate_lines(found):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = baselines.OneLineParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path, help="results/<name> or runs/...")
     parser.add_argument("figure", type=Path, help="the .png to write")
-    parser.add_argument("--eval-seed", type=int, default=0)
+    parser.add_argument("--eval-seed", type=baselines.integer(0, 2**31 - 1), default=0)
     options = parser.parse_args()
     try:
         agent, args, env_options = load(options.folder / "agent.safetensors")

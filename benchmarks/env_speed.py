@@ -1,13 +1,12 @@
 """Environment steps a second on one core: N environments in one native batch against a Python loop over single ones.
 
-    python benchmarks/env_speed.py [--num-envs 128] [--seconds 1.0]
+    python benchmarks/env_speed.py [--num-envs 128] [--seconds 1]
 
 Of each the best of three runs.
 """
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 from pathlib import Path
@@ -16,6 +15,7 @@ import gymnasium as gym
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+import baselines  # noqa: E402
 import envs  # noqa: E402
 
 
@@ -34,9 +34,9 @@ def steps_per_second(env, action, steps, seconds):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--num-envs", type=int, default=128)
-    parser.add_argument("--seconds", type=float, default=1.0)
+    parser = baselines.OneLineParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--num-envs", type=baselines.integer(1, 10**6), default=128)
+    parser.add_argument("--seconds", type=baselines.integer(1, 3600), default=1)
     args = parser.parse_args()
     print(f"{'id':35} {'batch of ' + str(args.num_envs):>14} {'single':>10}   steps/s on one core")
     rockets = [(env_id, {"action_frame": "local"}) for env_id in envs.ROCKETS]

@@ -7,7 +7,6 @@ Prints what was tried and how it ended; the first failure is an AssertionError. 
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import functools
 import importlib
@@ -32,6 +31,7 @@ import torch
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
+import baselines  # noqa: E402
 import envs  # noqa: E402
 import evaluate  # noqa: E402
 import runs  # noqa: E402
@@ -342,11 +342,11 @@ def soak(updates):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--kills", type=int, default=50)
-    parser.add_argument("--fuzz", type=int, default=10_000)
-    parser.add_argument("--soak", type=int, default=2000)
-    parser.add_argument("--seed", type=int, default=0)
+    parser = baselines.OneLineParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--kills", type=baselines.integer(0, 10**6), default=50)
+    parser.add_argument("--fuzz", type=baselines.integer(0, 10**9), default=10_000)
+    parser.add_argument("--soak", type=baselines.integer(1, 10**6), default=2000)
+    parser.add_argument("--seed", type=baselines.integer(0, 2**31 - 1), default=0)
     args = parser.parse_args()
     torch.set_num_threads(1)
     ended = kill_and_resume(args.kills, args.seed)

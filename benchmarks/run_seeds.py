@@ -16,7 +16,6 @@ if a run failed or could not be published; the others go on. Ctrl-C and SIGTERM 
 
 from __future__ import annotations
 
-import argparse
 import functools
 import importlib
 import json
@@ -30,6 +29,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
+import baselines  # noqa: E402
 import evaluate  # noqa: E402
 import runs  # noqa: E402
 
@@ -147,6 +147,12 @@ def publish(job, numbers):
     return True
 
 
+def next_free(waiting, running):
+    """The first waiting job whose run no running one has, or None: it would go on with it."""
+    busy = {job.run_dir() for job in running}
+    return next((job for job in waiting if job.run_dir() is None or job.run_dir() not in busy), None)
+
+
 def work(jobs, at_once, numbers):
     """Train the jobs, `at_once` at a time, and publish each as it ends; returns those that failed."""
     waiting, running = [job for job in jobs if not job.is_trained()], []
@@ -154,8 +160,8 @@ def work(jobs, at_once, numbers):
     failed = [job for job in jobs if job not in waiting and not publish(job, numbers)]
     try:
         while waiting or running:
-            while waiting and len(running) < at_once:
-                job = waiting.pop(0)
+            while len(running) < at_once and (job := next_free(waiting, [job for job, _ in running])):
+                waiting.remove(job)
                 running.append((job, job.start()))
                 print(f"started {shlex.join(job.command)}", flush=True)
             time.sleep(0.2)
@@ -175,13 +181,13 @@ def work(jobs, at_once, numbers):
 def main():
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell ignores it for what it starts in the background
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that `work` ends what it has started
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = baselines.OneLineParser(description=__doc__.splitlines()[0])
     parser.add_argument("jobs", help="file with one run a line")
-    parser.add_argument("--at-once", type=int, default=1, help="number of runs at a time")
+    parser.add_argument("--at-once", type=baselines.integer(1, 64), default=1, help="number of runs at a time")
     parser.add_argument("--numbers", action="store_true", help="publish evaluations and curves, no policies")
     options = parser.parse_args()
     try:
-        sys.exit(1 if work(read_jobs(options.jobs), max(1, options.at_once), options.numbers) else 0)
+        sys.exit(1 if work(read_jobs(options.jobs), options.at_once, options.numbers) else 0)
     except (OSError, ValueError) as error:
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:

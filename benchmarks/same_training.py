@@ -11,8 +11,8 @@ what was learned differs. What is flown is these weights' average, and no part o
 
 from __future__ import annotations
 
-import argparse
 import json
+import shutil
 import subprocess
 import sys
 import tarfile
@@ -24,6 +24,8 @@ import torch
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 import run_seeds  # noqa: E402
+
+from baselines import OneLineParser, integer  # noqa: E402
 
 COMMITS = ROOT / "results" / "commits.json"
 LISTS = [ROOT / "benchmarks" / f"{name}_jobs.txt" for name in ("result", "table_1")]
@@ -76,6 +78,9 @@ def compare(name, command, commits, updates, temporary):
         folder = temporary / commit
         if not folder.exists():
             checkout(commit, folder)
+        for flag, path in zip(command, command[1:]):
+            if flag == "--checkpoint" and commit != "HEAD":  # all begin with the same weights
+                shutil.copy(temporary / "HEAD" / path, folder / path)
         found[commit] = train(command, folder, updates)
     wrong = {commit: differing(found["HEAD"], found[commit]) for commit in commits}
     for commit, count in wrong.items():
@@ -85,15 +90,13 @@ def compare(name, command, commits, updates, temporary):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = OneLineParser(description=__doc__.splitlines()[0])
     parser.add_argument("results", nargs="*", help="folders of results/commits.json; without one, all")
-    parser.add_argument("--updates", type=int, default=6, help="updates of each training")
+    parser.add_argument("--updates", type=integer(1, 10**6), default=6, help="updates of each training")
     options = parser.parse_args()
     commits = json.loads(COMMITS.read_text())
     if unknown := sorted(set(options.results) - commits.keys()):
         sys.exit(f"error: results {', '.join(unknown)} must be among {', '.join(commits)}")
-    if options.updates < 1:
-        sys.exit(f"error: --updates {options.updates} must be at least 1")
     try:
         with tempfile.TemporaryDirectory() as folder:
             names, commands = options.results or commits, first_jobs()

@@ -379,6 +379,8 @@ def test_steps_outside_an_episode_are_refused(env_id):
     env.reset()
     with pytest.raises(ValueError, match="x0"):
         env.reset(options={"x0": [math.nan, 0.0]})
+    with pytest.raises(ValueError, match=r"reset options are .*'x1'.*; the only one is 'x0'"):
+        env.reset(options={"x1": 0.5})
     with pytest.raises(ResetNeeded):
         env.step(action)
 

@@ -540,6 +540,38 @@ def test_publish_ships_the_first_seed_and_adds_the_second(tmp_path, monkeypatch,
     assert (results / "agent.safetensors").read_bytes() == b"weights of seed 1"
 
 
+def test_a_results_folder_keeps_the_first_hundred_starts(tmp_path, monkeypatch):
+    """Drawn of all, kept of some."""
+    run, drawn = make_run(tmp_path / "a", seed=1), []
+    with np.load(run / "eval.npz") as file:
+        arrays = {key: file[key] for key in file.files}
+    many = {key: a if key == "t" else np.repeat(a, 150 // len(a) + 1, axis=0)[:150] for key, a in arrays.items()}
+    np.savez(run / "eval.npz", **many)
+    monkeypatch.setattr(evaluate, "redraw", lambda folder: drawn.append(len(np.load(folder / "eval.npz")["x"])))
+    monkeypatch.setattr(evaluate, "animate", lambda folder: None)
+    evaluate.publish(run, tmp_path / "results")
+    with np.load(tmp_path / "results" / "eval.npz") as kept:
+        assert drawn == [150] and kept.files == list(many)
+        for key, array in many.items():
+            np.testing.assert_array_equal(kept[key], array if key == "t" else array[:100])
+
+
+def test_seeds_alone_say_of_which_problem_a_folder_is(tmp_path):
+    run, other = make_run(tmp_path / "a", seed=1), tmp_path / "results" / "seeds" / "2.json"
+    other.parent.mkdir(parents=True)
+    other.write_text(json.dumps({"env_id": "VanDerPol-v0", "seed": 2}))
+    with pytest.raises(ValueError, match="2.json of VanDerPol-v0"):
+        evaluate.publish(run, tmp_path / "results", numbers=True)
+    assert [path.name for path in other.parent.iterdir()] == ["2.json"]
+
+
+@pytest.mark.parametrize("text", ["", "global_step,a\n", "global_step,a\nx,1\n", "global_step,a\n1\n"])
+def test_a_curve_that_is_none_is_named(tmp_path, text):
+    (tmp_path / "1.csv").write_text(text)
+    with pytest.raises(ValueError, match="1.csv is not a training curve"):
+        evaluate.read_csv(tmp_path / "1.csv")
+
+
 def test_shipping_another_seed_replaces_all_or_nothing(tmp_path, monkeypatch, capsys):
     first, second = make_run(tmp_path / "a", seed=1), make_run(tmp_path / "b", seed=2)
     results = tmp_path / "results" / "di"

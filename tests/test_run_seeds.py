@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import run_seeds
@@ -168,6 +169,9 @@ class Trained:
     def is_trained(self):
         return self.trained
 
+    def run_dir(self):
+        return None
+
     def start(self):
         return subprocess.Popen([sys.executable, "-c", ""])
 
@@ -192,6 +196,14 @@ def test_what_cannot_be_published_fails_alone(capsys, trained):
         "not published: first: results/x is of another problem",
         "not published: second: [Errno 28] No space left on device: 'results/x/eval.npz'",
     ]
+
+
+def test_two_jobs_never_go_on_with_one_run():
+    """A folder of its own does not make a job another run: it waits for the one with its arguments."""
+    here, there, new = (SimpleNamespace(run_dir=lambda run=run: run) for run in ("runs/a", "runs/b", None))
+    again = SimpleNamespace(run_dir=lambda: "runs/a")
+    assert run_seeds.next_free([again, there], [here]) is there and run_seeds.next_free([again], [there]) is again
+    assert run_seeds.next_free([again], [here, there]) is None and run_seeds.next_free([new], [here, new]) is new
 
 
 def test_without_a_run_nothing_is_published(tmp_path, monkeypatch):

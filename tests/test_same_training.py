@@ -57,7 +57,7 @@ def test_every_seed_of_the_results_has_its_commit():
     "flags, said",
     [
         (["results/none"], "results results/none must be among results/di, "),
-        (["--updates", "0"], "--updates 0 must be at least 1"),
+        (["--updates", "0"], "argument --updates: '0' must be a whole number from 1 to 1000000"),
     ],
 )
 def test_bad_input_is_one_line(flags, said):

@@ -1222,6 +1222,26 @@ def test_resume_of_another_script_says_so(refuses, trained, tmp_path, kind, reas
     assert reason in refuses("--resume", tmp_path / "run")
 
 
+def test_the_name_of_a_run_is_no_path(refuses):
+    for name in ("a/b", "../outside", "/tmp"):
+        assert f"--exp-name {name}: must be the name of a folder" in refuses("--exp-name", name)
+
+
+def test_a_dispersed_training_sees_its_time(refuses):
+    """Its flights are compared with the mean flight of the same step, which the observed time tells."""
+    message = refuses("--dispersion", 1, "--no-observe-phase", script=ROCKET)
+    assert message.startswith("error: --no-observe-phase: not in a training with --dispersion")
+
+
+def test_resume_of_another_vehicle(refuses, trained, tmp_path):
+    """A constant that the script no longer makes so, as after a change of a vehicle's file."""
+    run = Path(shutil.copytree(trained, tmp_path / "run"))
+    state = torch.load(run / "training_state.pt", weights_only=True)
+    state["agent"]["observation_scale"][0] *= 2
+    torch.save(state, run / "training_state.pt")
+    assert "observation_scale is not that of DoubleIntegrator-v0 now" in refuses("--resume", run)
+
+
 def test_resume_of_a_missing_folder(refuses):
     assert "--resume runs/none: " in refuses("--resume", "runs/none")
 

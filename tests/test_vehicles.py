@@ -84,6 +84,12 @@ REFUSED = {
     "burns[1].end is nan": lambda: replace(TWO, burns=(TWO.burns[0], Burn(math.nan, ((1, SECOND),)))),
     "burns[0].end is -1": lambda: replace(TWO, burns=(replace(TWO.burns[0], end=-1.0), TWO.burns[1])),
     "burns[1].engines is ()": lambda: replace(TWO, burns=(TWO.burns[0], Burn(555.0, ()))),
+    "number of an engine in burns[0].dropped is -3; it must be positive": lambda: replace(
+        ROCKET, burns=(replace(ROCKET.burns[0], dropped=((6, BOOSTER), (-3, SECOND))), *ROCKET.burns[1:])
+    ),
+    "a burn's end is '162'": lambda: Burn("162", ((1, FIRST),)),
+    "a burn's dropped is (('1', Engine(": lambda: Burn(162.0, ((1, FIRST),), dropped=(("1", FIRST),)),
+    "burns[1] is 555.0; it must be a Burn": lambda: replace(TWO, burns=(TWO.burns[0], 555.0)),
     "burns is ()": lambda: replace(TWO, burns=()),
     "burns is [Burn": lambda: replace(TWO, burns=list(TWO.burns)),
     "payload is nan": lambda: replace(TWO, payload=math.nan),
@@ -123,6 +129,41 @@ def test_what_is_refused_can_fly_a_little_beside_it():
     two_stages(last=554.0, end_time=554.0)
     two_stages(table_isp=True)
     replace(TWO, i=180.0 - 51.6, e=0.99, latitude=-51.0, payload=0.0, end_time=1.0)
+
+
+def test_a_stage_that_is_dropped_early_takes_its_propellant_along():
+    """Nominal and with nothing drawn alike: 140 of 162 s burnt, and 22.2 t of dry mass leave with the rest."""
+    rocket = two_stages(end=140.0, last=533.0, end_time=533.0)
+    unburnt = 411e3 * (1 - 140 / 162)
+    assert rocket.dropped == pytest.approx([22e3 + unburnt, 0.0])
+    register_rocket("Early-v0", rocket)
+    for options in ({}, {"dispersion": 1.0}):
+        batch = gym.make_vec("Early-v0", num_envs=1, action_frame="local", **options)
+        batch.reset(seed=0, options={"draw": np.zeros((1, 12))} if options else None)
+        masses = [batch.step(np.array([[1.0, 0.05, 0.0]])) and batch.y[6, 0] for _ in range(71)]
+        start, burnt = 433e3 + 111.5e3 + 20e3, 411e3 * 140 / 162
+        assert masses[69] == pytest.approx(start - burnt - 22e3 - unburnt, abs=1e-6)
+
+
+def test_a_tank_for_several_engines_flies_nominally_and_is_not_drawn():
+    """Nine engines, of which four stop early, hold out longer than each with a tank of its own."""
+    ninth = Engine(total_mass=433e3 / 9, propellant=411e3 / 9, thrust=7.6e6 / 9, isp=306.0, burn_time=162.0)
+    burns = (Burn(120.0, ((9, ninth),)), Burn(190.0, ((5, ninth),), ((9, ninth),)), Burn(583.0, ((1, SECOND),)))
+    rocket = replace(TWO, burns=burns, end_time=583.0)
+    register_rocket("Nine-v0", rocket)
+    gym.make_vec("Nine-v0", num_envs=1)
+    with pytest.raises(BadInput, match=r"burns\[1\].end is 190.0; it cannot be drawn: .* burn until 162 s"):
+        gym.make_vec("Nine-v0", num_envs=1, dispersion=1.0)
+
+
+def test_a_core_that_burnt_before_runs_dry_by_the_table_too():
+    """`table_isp`: beside two boosters and then alone, and never below its dry mass."""
+    core = Engine(total_mass=433e3, propellant=411e3, thrust=4e6, isp=300.0, burn_time=400.0)
+    burns = (Burn(100.0, ((1, core), (2, FIRST)), ((2, FIRST),)), Burn(400.0, ((1, core),)))
+    rocket = replace(TWO, burns=burns, end_time=400.0, table_isp=True)
+    flow = 4e6 / (9.80665 * 300.0)
+    *_, last, coast = rocket.arcs()
+    assert last[1] == pytest.approx(411e3 / flow) and coast[2] == coast[3] == 0.0
 
 
 def test_plane_below_the_launch_latitude_is_a_warning():
