@@ -282,7 +282,7 @@ class Ascent(Sheet):
     def _prepare_events(self):
         """What is dropped at the end of each burn, unseen until it happens; the last is the end of the flight."""
         self.events = []
-        for burn, dropped in zip(self.rocket.burns[:-1], self.rocket.dropped):
+        for burn, dropped in zip(self.rocket.burns[:-1], self.rocket.jettison):
             number = sum(n for n, _ in burn.dropped)
             engines = f"{number} engine{'s' * (number != 1)}, " if number else ""
             self.events.append((burn.end, f"{burn.end:.0f} s: {engines}{dropped / 1e3:.1f} t dropped"))

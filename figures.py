@@ -354,7 +354,7 @@ def label_ascent(panels: dict, velocity: list, rocket: envs.Rocket):
     for axis, ax in zip("xyz", velocity):
         ax.set_ylabel(f"velocity $v_{axis}$ (km/s), pale", color="0.4")
         ax.tick_params(axis="y", colors="0.4")
-    for k, (burn, dropped) in enumerate(zip(rocket.burns[:-1], rocket.dropped)):  # the last burn drops nothing
+    for k, (burn, dropped) in enumerate(zip(rocket.burns[:-1], rocket.jettison)):  # the last burn drops nothing
         text, height = f" {burn.end:g} s: {dropped / 1e3:.2f} t dropped", 0.9 - 0.15 * (k % 5)  # of the axes
         side = "left" if burn.end <= rocket.end_time / 2 else "right"  # towards the middle: inside the panel
         where = {"transform": panels["mass"].get_xaxis_transform(), "horizontalalignment": side}

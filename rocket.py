@@ -185,7 +185,7 @@ class Rocket:
         A last stage that runs dry before its phase ends gives an arc of its own without thrust.
         """
         arcs, start = [], 0.0
-        for burn, dropped in zip(self.burns, self.dropped):
+        for burn, dropped in zip(self.burns, self.jettison):
             flow = burn.flow(self.table_isp)
             dry = start + self.last_propellant / flow if flow else np.inf  # a coast
             if burn is self.burns[-1] and dry < burn.end - 1e-6:  # rounding alone is not an event
@@ -196,7 +196,7 @@ class Rocket:
         return arcs
 
     @property
-    def dropped(self) -> list[float]:
+    def jettison(self) -> list[float]:
         """kg that leave at the end of each burn: dry mass, and the propellant that the dropped engines have not burnt.
 
         With `table_isp` that propellant stays on board: so the paper's table, which contradicts itself, is flown.
@@ -560,7 +560,7 @@ def check_drawable(rocket: Rocket):
     Drawn engines burn each from a tank of its own, and those that are dropped together burn together.
     """
     drawn = draw_vehicles(rocket, 1.0, np.zeros((1, len(draw_names(rocket)))))
-    ends, dropped = [burn.end for burn in rocket.burns], rocket.dropped
+    ends, dropped = [burn.end for burn in rocket.burns], rocket.jettison
     for k in range(len(rocket.burns) - 1):
         allowed = f"cannot be drawn: its engines, each from its own tank, burn until {drawn.end[k, 0]:.6g} s"
         refuse_unless(np.isclose(ends[k], drawn.end[k, 0]), f"burns[{k}].end", ends[k], allowed)

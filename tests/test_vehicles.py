@@ -135,7 +135,7 @@ def test_a_stage_that_is_dropped_early_takes_its_propellant_along():
     """Nominal and with nothing drawn alike: 140 of 162 s burnt, and 22.2 t of dry mass leave with the rest."""
     rocket = two_stages(end=140.0, last=533.0, end_time=533.0)
     unburnt = 411e3 * (1 - 140 / 162)
-    assert rocket.dropped == pytest.approx([22e3 + unburnt, 0.0])
+    assert rocket.jettison == pytest.approx([22e3 + unburnt, 0.0])
     register_rocket("Early-v0", rocket)
     for options in ({}, {"dispersion": 1.0}):
         batch = gym.make_vec("Early-v0", num_envs=1, action_frame="local", **options)
