@@ -813,7 +813,7 @@ SEED_ROWS = {  # key of eval.json -> its row in the table of a folder's seeds
 
 def seed_lines(folder) -> list[str]:
     """A table of a results folder's seeds with their medians and ranges, a row each figure; none for one seed."""
-    runs = sorted((read_metrics(path) for path in (Path(folder) / "seeds").glob("*.json")), key=lambda run: run["seed"])
+    runs = sorted((read_json(path) for path in (Path(folder) / "seeds").glob("*.json")), key=lambda run: run["seed"])
     if len(runs) < 2:
         return []
     for run in runs:
@@ -823,6 +823,8 @@ def seed_lines(folder) -> list[str]:
     lines = [f"{'':40}" + "".join(f"{head:>10}" for head in heads)]
     for key, (label, form) in SEED_ROWS.items():
         if values := [run[key] for run in runs if key in run]:
+            if not all(isinstance(value, int | float) for value in values):
+                raise ValueError(f"{key} is {values} in {folder}/seeds; it must be a number")
             cells = [format(run[key], form) if key in run else "-" for run in runs]
             cells += [format(value, form) for value in (np.median(values), min(values), max(values))]
             lines.append(f"  {label:38}" + "".join(f"{cell:>10}" for cell in cells))

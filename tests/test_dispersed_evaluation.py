@@ -202,3 +202,6 @@ def test_seeds_that_were_flown_dispersed_have_rows_of_their_own(tmp_path):
     assert rows[rate] == ["75.0%", "87.5%", "100.0%", "-", "87.5%", "75.0%", "100.0%"]
     assert rows["dispersed: perigee off, sigma (km)"][:4] == ["4.50", "4.50", "4.50", "-"]
     assert rows["||error||"] == ["0.100000"] * 7
+    (tmp_path / "seeds" / "4.json").write_text(json.dumps(nominal | {"seed": 4, "error_norm": None}))
+    with pytest.raises(ValueError, match=r"error_norm is \[0.1, 0.1, 0.1, None\] in .*seeds; it must be a number"):
+        evaluate.seed_lines(tmp_path)
