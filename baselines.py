@@ -45,7 +45,7 @@ from rocket_baselines import (
     mission_ascent,
     nine_pitch_angles,
     optimise_ascent,
-    return_status,
+    run_ipopt,
     solve_ascent,
 )
 
@@ -276,8 +276,8 @@ def _solve_start(task):
     T = PROBLEMS[env_id].steps
     solutions, statuses = [], []
     for guess in guesses(env_id, x0):
-        solution = solve(p=x0, x0=guess, **arguments)
-        statuses.append(return_status(solve))
+        solution, status = run_ipopt(solve, p=x0, x0=guess, **arguments)
+        statuses.append(status)
         multipliers = solution["lam_g"].full()[2 * T :, 0]
         solutions.append((solution["x"].full()[:T, 0], float(solution["f"]), multipliers))
     solved = [k for k, status in enumerate(statuses) if status == "Solve_Succeeded"]

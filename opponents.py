@@ -32,8 +32,8 @@ from rocket_baselines import (
     collocation,
     interpolate,
     orbit_defect,
-    return_status,
     rocket_reference,
+    run_ipopt,
     state_scale,
 )
 
@@ -251,8 +251,7 @@ def optimise_rest(rocket: Rocket, rest: Rest, guess: dict, intervals: tuple[int,
     equal, radius = np.zeros(n * (7 * points + 6) + 5), np.full(n, 1 + 1 / rocket.Re)
     bounds = {"lbx": np.append(-box, 0.0), "ubx": np.append(box, rest.end[-1] - ignition)}
     bounds |= {"lbg": np.append(equal, radius), "ubg": np.append(equal, np.full(n, np.inf))}
-    solution = solve(x0=w, p=rest_parameters(rocket, rest, intervals), **bounds)
-    status = return_status(solve)
+    solution, status = run_ipopt(solve, x0=w, p=rest_parameters(rocket, rest, intervals), **bounds)
     if status != "Solve_Succeeded":
         raise NoOptimum(f"the rest of an ascent from {rest.begin} s: IPOPT stopped with {status}")
     w = solution["x"].full()[:, 0]

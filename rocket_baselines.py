@@ -190,12 +190,16 @@ def interpolate(times, t, values):
     return np.column_stack([np.interp(times, t, column) for column in values.T])
 
 
-def return_status(solve) -> str:
-    """How IPOPT ended; KeyboardInterrupt where a signal did it, which CasADi would pass over as one more failure."""
+def run_ipopt(solve, **arguments) -> tuple[dict, str]:
+    """CasADi's solution and how IPOPT ended; KeyboardInterrupt where a signal ended it.
+
+    CasADi would pass over it, as one more failure of IPOPT, or with nothing for a solution.
+    """
+    solution = solve(**arguments)
     status = solve.stats()["return_status"]
-    if status == "NonIpopt_Exception_Thrown":
+    if solution is None or status == "NonIpopt_Exception_Thrown":
         raise KeyboardInterrupt
-    return status
+    return solution, status
 
 
 def ascend(case: Ascent, mesh: Mesh, guess: dict) -> dict:
@@ -219,8 +223,7 @@ def ascend(case: Ascent, mesh: Mesh, guess: dict) -> dict:
     equal = np.zeros(program["g"].numel() - n)
     low, high = (np.append(equal, np.full(n, 1 + h / rocket.Re)) for h in (case.floor, case.ceiling))
     lbx, ubx = np.append(-box, mesh.final_time[0]), np.append(box, mesh.final_time[1])
-    solution = solve(x0=start, lbx=lbx, ubx=ubx, lbg=low, ubg=high)
-    status = return_status(solve)
+    solution, status = run_ipopt(solve, x0=start, lbx=lbx, ubx=ubx, lbg=low, ubg=high)
     if status != "Solve_Succeeded":
         raise NoOptimum(f"rocket ascent {case.key}: IPOPT stopped with {status}")
     w, end = solution["x"].full()[:-1, 0], float(solution["x"][-1])
