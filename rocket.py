@@ -187,10 +187,11 @@ class Rocket:
         arcs, start = [], 0.0
         for burn, dropped in zip(self.burns, self.jettison):
             flow = burn.flow(self.table_isp)
-            dry = start + self.last_propellant / flow if flow else np.inf  # a coast
-            if burn is self.burns[-1] and dry < burn.end - 1e-6:  # rounding alone is not an event
-                arcs.append((start, dry, burn.thrust, flow, 0.0))
-                start, flow = dry, 0.0
+            if burn is self.burns[-1] and self.table_isp and flow:  # without it the propellant covers all burns
+                dry = start + self.last_propellant / flow
+                if dry < burn.end - 1e-6:  # rounding alone is not an event
+                    arcs.append((start, dry, burn.thrust, flow, 0.0))
+                    start, flow = dry, 0.0
             arcs.append((start, burn.end, burn.thrust if flow else 0.0, flow, dropped))
             start = burn.end
         return arcs
@@ -199,18 +200,22 @@ class Rocket:
     def jettison(self) -> list[float]:
         """kg that leave at the end of each burn: dry mass, and the propellant that the dropped engines have not burnt.
 
-        With `table_isp` that propellant stays on board: so the paper's table, which contradicts itself, is flown.
+        What others of their type burn later stays on board. With `table_isp` all of it does: so the paper's table,
+        which contradicts itself, is flown.
         """
         dry = lambda parts: sum(n * (engine.total_mass - engine.propellant) for n, engine in parts)  # noqa: E731
-        dropped = [float(dry(burn.dropped)) for burn in self.burns]
+        dropped, used = [float(dry(burn.dropped)) for burn in self.burns], propellant_used(self)
+        left = {engine: n * engine.propellant - used.get(engine, 0.0) for engine, n in engines_aboard(self, 0).items()}
         for number, engine, _, k, _, part, full in engine_groups(self):
             if k < len(self.burns) - 1 and part < full * (1 - 1e-9) and not self.table_isp:
-                dropped[k] += number * (engine.propellant - engine.flow(False) * part)
+                leaves = max(min(number * (engine.propellant - engine.flow(False) * part), left[engine]), 0.0)
+                dropped[k] += leaves
+                left[engine] -= leaves
         return dropped
 
     @property
     def last_propellant(self) -> float:
-        """kg in the last burn's engines when it begins: all, less what they burnt in earlier burns."""
+        """kg in the last burn's engines when it begins, each with its own tank: all, less what they burnt before."""
         seconds = self.burns[-1].end - self.last_ignition
         groups = [group for group in engine_groups(self) if group.dropped == len(self.burns) - 1]
         return sum(
@@ -252,7 +257,7 @@ def check_burns(rocket: Rocket):
     """BadInput where the burns are not in order, burn what is not aboard, or longer than their propellant lasts."""
     refuse_unless(isinstance(rocket.burns, tuple), "a rocket's burns", rocket.burns, "must be a tuple")
     refuse_unless(rocket.burns, "a rocket's burns", rocket.burns, "must hold at least one burn")
-    start, used = 0.0, {}
+    start = 0.0
     for k, burn in enumerate(rocket.burns):
         refuse_unless(isinstance(burn, Burn), f"burns[{k}]", f"{burn!r:.60}", "must be a Burn")
     for k, burn in enumerate(rocket.burns):
@@ -267,13 +272,12 @@ def check_burns(rocket: Rocket):
             refuse_unless(has > 0, f"an engine of burns[{k}]", engine, allowed)
             allowed = f"must be positive and at most {has}: so many are dropped then or later, or are of the last burn"
             refuse_unless(0 < number <= has, field, number, allowed)
-            used[engine] = used.get(engine, 0.0) + number * engine.flow(rocket.table_isp) * (burn.end - start)
         for number, _ in burn.dropped:
             refuse_unless(number > 0, f"the number of an engine in burns[{k}].dropped", number, "must be positive")
         start = burn.end
     last, allowed = rocket.burns[-1].dropped, "must be empty: the last burn's engines stay aboard"
     refuse_unless(not last, f"burns[{k}].dropped", f"{last!r:.60}", allowed)
-    first = engines_aboard(rocket, 0)
+    first, used = engines_aboard(rocket, 0), propellant_used(rocket)
     runs_dry = [engine for _, engine in rocket.burns[-1].engines] if rocket.table_isp else []
     for k, burn in enumerate(rocket.burns):
         for _, engine in burn.engines:
@@ -281,6 +285,16 @@ def check_burns(rocket: Rocket):
             covered = engine in runs_dry or used[engine] <= has * (1 + 1e-9)
             field = f"the propellant of burns[{k}].engines, {engine.propellant} kg each,"
             refuse_unless(covered, field, f"{has:.6g} kg in all", f"must cover their burns, {used[engine]:.6g} kg")
+
+
+def propellant_used(rocket: Rocket) -> dict:
+    """kg of propellant that all engines of each type burn, if none runs dry."""
+    start, used = 0.0, {}
+    for burn in rocket.burns:
+        for number, engine in burn.engines:
+            used[engine] = used.get(engine, 0.0) + number * engine.flow(rocket.table_isp) * (burn.end - start)
+        start = burn.end
+    return used
 
 
 def engines_aboard(rocket: Rocket, k: int) -> dict:
@@ -560,15 +574,15 @@ def check_drawable(rocket: Rocket):
     Drawn engines burn each from a tank of its own, and those that are dropped together burn together.
     """
     drawn = draw_vehicles(rocket, 1.0, np.zeros((1, len(draw_names(rocket)))))
-    ends, dropped = [burn.end for burn in rocket.burns], rocket.jettison
-    for k in range(len(rocket.burns) - 1):
-        allowed = f"cannot be drawn: its engines, each from its own tank, burn until {drawn.end[k, 0]:.6g} s"
-        refuse_unless(np.isclose(ends[k], drawn.end[k, 0]), f"burns[{k}].end", ends[k], allowed)
-        kept = rocket.table_isp  # propellant that a drawn flight drops
-        allowed = f"cannot be drawn: what has not burnt then makes it {drawn.dropped[k, 0]:.6g} kg"
-        refuse_unless(
-            kept or np.isclose(dropped[k], drawn.dropped[k, 0]), f"what burns[{k}] drops", f"{dropped[k]} kg", allowed
-        )
+    last = len(rocket.burns) - 1
+    for k, (burn, dropped) in enumerate(zip(rocket.burns, rocket.jettison)):
+        ends, leaves = drawn.end[k, 0], drawn.dropped[k, 0]
+        same = np.isclose(burn.end, ends) or (k == last and (ends > burn.end or rocket.table_isp))
+        allowed = f"cannot be drawn: its engines, each from its own tank, burn until {ends:.6g} s"
+        refuse_unless(same, f"burns[{k}].end", burn.end, allowed)
+        same = np.isclose(dropped, leaves) or rocket.table_isp  # a drawn flight drops what has not burnt
+        allowed = f"cannot be drawn: with what has not burnt then it is {leaves:.6g} kg"
+        refuse_unless(same, f"what burns[{k}] drops", f"{dropped:.6g} kg", allowed)
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -156,6 +156,24 @@ def test_a_tank_for_several_engines_flies_nominally_and_is_not_drawn():
         gym.make_vec("Nine-v0", num_envs=1, dispersion=1.0)
 
 
+@pytest.mark.parametrize("first, later", [((3, 100.0, 2), 250.0), ((2, 120.0, 0), 200.0)])
+def test_engines_that_share_a_tank_never_burn_what_was_dropped(first, later):
+    """Two of three cores dropped early, and two of five lit first: what burns and what leaves is what was loaded."""
+    number, end, gone = first
+    core = Engine(total_mass=433e3, propellant=411e3, thrust=12e6, isp=306.0, burn_time=150.0)
+    last = 1 if gone else 5
+    burns = (Burn(end, ((number, core),), ((gone, core),) if gone else ()), Burn(later, ((last, core),)))
+    rocket = replace(TWO, burns=burns, payload=1e3 if gone else 1e2, end_time=later)
+    arcs = rocket.arcs()
+    assert len(arcs) == 2 and arcs[-1][2] == last * 12e6  # none without thrust
+    burnt = sum((stop - start) * flow for start, stop, _, flow, _ in arcs)
+    assert burnt == pytest.approx(411e3 / 150 * (number * end + last * (later - end)))
+    assert rocket.x0[6] - burnt - sum(rocket.jettison) >= rocket.dry_mass - 1e-6
+    register_rocket("Shared-v0", rocket)
+    with pytest.raises(BadInput, match="cannot be drawn"):
+        gym.make_vec("Shared-v0", num_envs=1, dispersion=1.0)
+
+
 def test_a_core_that_burnt_before_runs_dry_by_the_table_too():
     """`table_isp`: beside two boosters and then alone, and never below its dry mass."""
     core = Engine(total_mass=433e3, propellant=411e3, thrust=4e6, isp=300.0, burn_time=400.0)
