@@ -175,7 +175,7 @@ def shape_rewards(envs, args, progress, batch, episodes):
     would hide them. So they are paid in units of what R_terminal scatters by beyond its own regression: little while
     the orbit is off to one side, and the errors matter linearly. At the end the orbit alone counts.
     """
-    weight = envs.cutoff * args.mass_weight * np.interp(progress, [0.1, 0.2, 0.6, 0.95], [0.0, 1.0, 1.0, 0.0])
+    weight = envs.cutoff * args.mass_weight * np.interp(progress, [0.1, 0.2, 0.5, 0.85], [0.0, 1.0, 1.0, 0.0])
     if not weight:
         return
     error, error_norm = episodes["error"], episodes["error_norm"]

@@ -83,7 +83,7 @@ def test_far_flights_take_no_part():
 
 
 @pytest.mark.parametrize(
-    ("progress", "share"), [(0.0, 0), (0.1, 0), (0.15, 0.5), (0.6, 1), (0.775, 0.5), (0.95, 0), (1, 0)]
+    ("progress", "share"), [(0.0, 0), (0.1, 0), (0.15, 0.5), (0.5, 1), (0.675, 0.5), (0.85, 0), (1, 0)]
 )
 def test_course(progress, share):
     np.testing.assert_allclose(paid(flights(), progress), share * paid(flights(), 0.3), rtol=1e-5, atol=1e-7)
