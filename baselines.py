@@ -42,10 +42,10 @@ from rocket_baselines import (
     SEGMENTS,
     STORED,
     NoOptimum,
+    interruptible,
     mission_ascent,
     nine_pitch_angles,
     optimise_ascent,
-    run_ipopt,
     solve_ascent,
 )
 
@@ -269,6 +269,7 @@ def guesses(env_id: str, x0):
                 yield guess
 
 
+@interruptible()
 def _solve_start(task):
     """Solve one start, as `optimise` returns it. A task holds all it needs, so that any process can take it."""
     env_id, defect, in_circles, index, x0 = task
@@ -276,8 +277,8 @@ def _solve_start(task):
     T = PROBLEMS[env_id].steps
     solutions, statuses = [], []
     for guess in guesses(env_id, x0):
-        solution, status = run_ipopt(solve, p=x0, x0=guess, **arguments)
-        statuses.append(status)
+        solution = solve(p=x0, x0=guess, **arguments)
+        statuses.append(solve.stats()["return_status"])
         multipliers = solution["lam_g"].full()[2 * T :, 0]
         solutions.append((solution["x"].full()[:T, 0], float(solution["f"]), multipliers))
     solved = [k for k, status in enumerate(statuses) if status == "Solve_Succeeded"]

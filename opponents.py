@@ -31,9 +31,9 @@ from rocket_baselines import (
     NoOptimum,
     collocation,
     interpolate,
+    interruptible,
     orbit_defect,
     rocket_reference,
-    run_ipopt,
     state_scale,
 )
 
@@ -235,6 +235,7 @@ def rest_parameters(rocket: Rocket, rest: Rest, intervals) -> np.ndarray:
     return np.concatenate([start, engine.T.ravel(), burn, rest.air, rest.h, rest.e])
 
 
+@interruptible()
 def optimise_rest(rocket: Rocket, rest: Rest, guess: dict, intervals: tuple[int, ...]) -> dict:
     """The heaviest end of an ascent's rest, `intervals` of collocation in each of its arcs.
 
@@ -251,7 +252,8 @@ def optimise_rest(rocket: Rocket, rest: Rest, guess: dict, intervals: tuple[int,
     equal, radius = np.zeros(n * (7 * points + 6) + 5), np.full(n, 1 + 1 / rocket.Re)
     bounds = {"lbx": np.append(-box, 0.0), "ubx": np.append(box, rest.end[-1] - ignition)}
     bounds |= {"lbg": np.append(equal, radius), "ubg": np.append(equal, np.full(n, np.inf))}
-    solution, status = run_ipopt(solve, x0=w, p=rest_parameters(rocket, rest, intervals), **bounds)
+    solution = solve(x0=w, p=rest_parameters(rocket, rest, intervals), **bounds)
+    status = solve.stats()["return_status"]
     if status != "Solve_Succeeded":
         raise NoOptimum(f"the rest of an ascent from {rest.begin} s: IPOPT stopped with {status}")
     w = solution["x"].full()[:, 0]

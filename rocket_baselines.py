@@ -8,10 +8,13 @@ small problems and the command line; every name here is also one of `baselines`.
 from __future__ import annotations
 
 import json
+import signal
+import threading
 import time
 import tokenize
 import warnings
 import zlib
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -190,18 +193,44 @@ def interpolate(times, t, values):
     return np.column_stack([np.interp(times, t, column) for column in values.T])
 
 
-def run_ipopt(solve, **arguments) -> tuple[dict, str]:
-    """CasADi's solution and how IPOPT ended; KeyboardInterrupt where a signal ended it.
+@contextmanager
+def interruptible():
+    """What the handler of SIGINT or SIGTERM raised in the block leaves it: KeyboardInterrupt, if nobody changed it.
 
-    CasADi would pass over it, as one more failure of IPOPT, or with nothing for a solution.
+    CasADi would take it for one more failure of IPOPT, return nothing, raise a RuntimeError, or, where it tries an
+    argument's types, pass over it.
     """
-    solution = solve(**arguments)
-    status = solve.stats()["return_status"]
-    if solution is None or status == "NonIpopt_Exception_Thrown":
-        raise KeyboardInterrupt
-    return solution, status
+    raised: list[BaseException] = []
+
+    def noted(handler):
+        def note(signum, frame):
+            try:
+                handler(signum, frame)
+            except BaseException as error:
+                raised.append(error)
+                raise
+
+        return note
+
+    handlers = {}
+    if threading.current_thread() is threading.main_thread():  # the only one that signals reach
+        handlers = {signum: signal.getsignal(signum) for signum in (signal.SIGINT, signal.SIGTERM)}
+        handlers = {signum: handler for signum, handler in handlers.items() if callable(handler)}
+    try:
+        for signum, handler in handlers.items():
+            signal.signal(signum, noted(handler))
+        yield
+    except Exception:
+        if not raised:
+            raise
+    finally:
+        for signum, handler in handlers.items():
+            signal.signal(signum, handler)
+    if raised:
+        raise raised[0]
 
 
+@interruptible()
 def ascend(case: Ascent, mesh: Mesh, guess: dict) -> dict:
     """Solve `ascent_program` from a guess with t (s), y (its states, at least r and v), t_u (s), u (directions).
 
@@ -223,7 +252,8 @@ def ascend(case: Ascent, mesh: Mesh, guess: dict) -> dict:
     equal = np.zeros(program["g"].numel() - n)
     low, high = (np.append(equal, np.full(n, 1 + h / rocket.Re)) for h in (case.floor, case.ceiling))
     lbx, ubx = np.append(-box, mesh.final_time[0]), np.append(box, mesh.final_time[1])
-    solution, status = run_ipopt(solve, x0=start, lbx=lbx, ubx=ubx, lbg=low, ubg=high)
+    solution = solve(x0=start, lbx=lbx, ubx=ubx, lbg=low, ubg=high)
+    status = solve.stats()["return_status"]
     if status != "Solve_Succeeded":
         raise NoOptimum(f"rocket ascent {case.key}: IPOPT stopped with {status}")
     w, end = solution["x"].full()[:-1, 0], float(solution["x"][-1])

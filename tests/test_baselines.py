@@ -4,6 +4,7 @@ import json
 import signal
 import subprocess
 import sys
+import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 
 import baselines
-from baselines import box_qp, hermite_simpson, lqr, lqr_policy, optimise, reference, replay
+from baselines import box_qp, hermite_simpson, interruptible, lqr, lqr_policy, optimise, reference, replay
 from envs import DOUBLE_INTEGRATOR, PROBLEMS, VAN_DER_POL, Phase, Problem, double_integrator, fly
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -129,17 +130,52 @@ def test_collocation_and_linear_feedback_beside_the_optimum():
     assert (linear > optimum * (1 - 1e-9)).all() and 1.00005 < linear.sum() / optimum.sum() < 1.001
 
 
-def test_a_signal_in_a_solve_is_not_taken_for_a_failure():
-    """CasADi turns what a signal's handler raises into one more of IPOPT's return statuses."""
-    before = signal.signal(signal.SIGALRM, signal.default_int_handler)
+def test_a_signal_in_a_solve_is_not_lost():
+    """CasADi turns what a signal's handler raises into one more of IPOPT's return statuses, among others."""
+    x0 = starts(300)
+    optimise("VanDerPol-v0", x0[:1], processes=1)  # builds the program
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
-        for delay in (0.3, 0.37, 0.44):  # of 300 solves of 10 ms or more, which fill nearly all of that time
-            signal.setitimer(signal.ITIMER_REAL, delay)
+        for delay in (0.02, 0.023, 0.026):  # of 300 solves, which take 0.7 s or more
+            timer = threading.Timer(delay, signal.raise_signal, [signal.SIGINT])
+            timer.start()
             with pytest.raises(KeyboardInterrupt):
-                optimise("VanDerPol-v0", starts(300), processes=1)
+                optimise("VanDerPol-v0", x0, processes=1)
+            timer.join()
+            assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
+        signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.parametrize("passed_over", ["nothing", "an exception of another kind", "an interrupt"])
+def test_what_a_handler_raised_is_raised_at_the_end(passed_over):
+    """Where CasADi passes over it; the handler that was there is back then."""
+
+    def handler(signum, frame):
+        raise KeyboardInterrupt(signum)
+
+    @interruptible()
+    def solve():
+        try:
+            signal.raise_signal(signal.SIGTERM)
+        except KeyboardInterrupt:
+            if passed_over == "an interrupt":
+                raise
+        if passed_over == "an exception of another kind":
+            raise RuntimeError
+
+    before = signal.signal(signal.SIGTERM, handler)
+    try:
+        with pytest.raises(KeyboardInterrupt, match=str(signal.SIGTERM.value)):
+            solve()
+        assert signal.getsignal(signal.SIGTERM) is handler
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def test_a_block_without_a_signal_keeps_its_own_errors():
+    with pytest.raises(ZeroDivisionError), interruptible():
+        raise ZeroDivisionError
 
 
 def test_result_does_not_depend_on_the_number_of_processes():
