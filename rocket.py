@@ -321,7 +321,7 @@ class Mission:
     floor_km: float = 110.0  # altitude below which a flight is penalised late in its ascent
     late: float = 300.0  # s after which it is late
     guided_until: float | None = None  # s until which R_guidance has a reference pitch (none: the first burn's end)
-    mass_unit: float | None = None  # kg whose burning --mass-weight prices (none: 6 % of the dry mass)
+    mass_unit: float | None = None  # kg of propellant that `mass_weight` is the price of (none: 6 % of the dry mass)
 
     def __post_init__(self):
         for name in ("ceiling_km", "floor_km", "late", "guided_until", "mass_unit"):

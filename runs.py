@@ -624,6 +624,13 @@ def gathered(value):
     return values
 
 
+def own_part(values, count):
+    """Of all processes' `values`, in the order of their ranks, the `count` of this one."""
+    rank, _ = process()
+    begin = sum(gathered(count)[:rank])
+    return values[begin : begin + count]
+
+
 def sum_gradients(agent):
     """Sum the gradients over all processes, in place, in one buffer: small exchanges cost their latency."""
     if dist.is_initialized():

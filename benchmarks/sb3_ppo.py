@@ -5,11 +5,11 @@
     python benchmarks/sb3_ppo.py --env-id RocketAscentCutoff-v0 --batch-size 512 --learning-rate 1e-3
     python benchmarks/sb3_ppo.py --env-id RocketAscentCutoff-v0 --recurrent --dispersion 1 --start RUN.zip
 
-It is given what our script gives its own learner: the curriculum (price of the propellant, scale of R_terminal), the
-first mean action and its noise, the local frame, and our features of the observation (of dispersed flights beside their
-mean, too), or with --features raw the observation itself. The rest is that library's: feed-forward networks for actor
-and critic (an LSTM with --recurrent, of sb3-contrib), VecNormalize of inputs and rewards, its discount, clipping and
-epochs. `peers.py` runs and lists all.
+It is given what our script gives its own learner: the curriculum (scale of R_terminal), the first mean action and its
+noise, the local frame, and our features of the observation (of dispersed flights beside their mean, too), or with
+--features raw the observation itself; propellant has a price by the kilogram. The rest is that library's: feed-forward
+networks for actor and critic (an LSTM with --recurrent, of sb3-contrib), VecNormalize of inputs and rewards, its
+discount, clipping and epochs. `peers.py` runs and lists all.
 """
 
 from __future__ import annotations
@@ -67,7 +67,12 @@ class OurFeatures(VecEnvWrapper):
 
 
 class OurCurriculum(BaseCallback):
-    """Before each rollout, what our script changes by the share of training done."""
+    """Before each rollout, what our script changes by the share of training done, and the price of propellant.
+
+    Ours compares the masses of flights that have all ended (`shape_rewards`). This library's rollouts end in the midst
+    of flights, so here propellant costs by the kilogram, as it did in our script until 20f94d3: nothing in the first
+    quarter, most at 60 %, a tenth of that at the end.
+    """
 
     def __init__(self, script, args, batch, samples):
         super().__init__()
@@ -75,7 +80,11 @@ class OurCurriculum(BaseCallback):
 
     def _on_rollout_start(self):
         std = self.model.policy.log_std.exp().mean().item()
-        self.script.set_curriculum(self.batch, self.args, self.num_timesteps / self.samples, False, std)
+        progress = self.num_timesteps / self.samples
+        self.script.set_curriculum(self.batch, self.args, progress, False, std)
+        if self.args.env_id in envs.ROCKETS:
+            price = np.interp(progress, [0.25, 0.6, 1.0], [0.0, 1.0, 0.1])
+            self.batch.mass_weight = float(self.batch.cutoff * self.args.mass_weight * price)
         self.batch.flights_per_start = 1  # the library compares no flights of one start
 
     def _on_step(self):
@@ -239,7 +248,7 @@ def parse_args():
     parser.add_argument("--features", default="ours", choices=["ours", "raw"])
     parser.add_argument("--recurrent", action="store_true", help="an LSTM: sb3-contrib's RecurrentPPO")
     parser.add_argument("--dispersion", type=float, help="every flight another vehicle (a rocket's)")
-    parser.add_argument("--mass-weight", type=float, help="highest price of the propellant (default: our script's)")
+    parser.add_argument("--mass-weight", type=float, default=3.0, help="highest price of a mission's mass_unit")
     parser.add_argument("--log-std", type=float, help="first log-std (default: our script's, or that of --start)")
     parser.add_argument("--num-envs", type=int, default=32)
     parser.add_argument("--batch-size", type=int, default=64)
@@ -259,8 +268,8 @@ def parse_args():
             parser.error(f"{flag(name)} {value}: must be between {low} and {high}")
     if options.seed == 0:
         parser.error("--seed 0: must be at least 1; the evaluation's starts are those of seed 0")
-    for name in ("dispersion", "mass_weight"):
-        if getattr(options, name) is not None and options.env_id not in envs.ROCKETS:
+    for name, without in (("dispersion", None), ("mass_weight", 3.0)):
+        if getattr(options, name) != without and options.env_id not in envs.ROCKETS:
             parser.error(f"{flag(name)} {getattr(options, name)}: only a rocket has it, not {options.env_id}")
     for path in (options.start, options.start and options.start.with_suffix(".pkl")):
         if path and not path.is_file():

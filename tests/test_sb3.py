@@ -135,7 +135,7 @@ def test_the_benchmark_follows_our_curriculum():
 
     import ppo_gtrxl_rocket as script
 
-    env_id, args = "RocketAscentCutoff-v0", script.Args(env_id="RocketAscentCutoff-v0")
+    env_id, args = "RocketAscentCutoff-v0", script.Args(env_id="RocketAscentCutoff-v0", mass_weight=3.0)
     batch = gym.make_vec(env_id, num_envs=2, action_frame="local").unwrapped
     model = PPO("MlpPolicy", NativeVecEnv(batch), n_steps=8, batch_size=16, n_epochs=1, device="cpu", seed=0)
     prices = []

@@ -1,0 +1,124 @@
+"""What training pays the cut-off rocket for its mass: against least squares, and what must not change it."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+import ppo_gtrxl_rocket as script
+from envs import terminal_reward
+
+N = 32
+ENV_ID = "RocketAscentCutoff-v0"
+
+
+def flights(seed=0, size=1e-3):
+    """Ends of N flights near the target, their errors of four directions, as with cut-off."""
+    rng = np.random.default_rng(seed)
+    error = size * rng.standard_normal((N, 4)) @ rng.standard_normal((4, 6))
+    mass = 7500 + rng.standard_normal(N)
+    return {"error": error, "error_norm": np.linalg.norm(error, axis=1), "final_mass_kg": mass}
+
+
+def paid(episodes, progress=0.4, env_id=ENV_ID, flying=N, **flags):
+    """The rewards (T, flying) that `shape_rewards` adds; flight k lives k + 1 steps."""
+    args = script.Args(env_id=env_id, num_envs=flying, **flags)
+    envs = gym.make_vec(env_id, num_envs=flying, dispersion=args.dispersion).unwrapped
+    envs.terminal_scale = 0.002
+    alive = (torch.arange(flying)[:, None] <= torch.arange(flying)).float()
+    rewards = torch.zeros(flying, flying)
+    batch = script.Batch(*[torch.zeros(0)] * 3, rewards, torch.zeros(0), alive, torch.zeros(0))
+    script.shape_rewards(envs, args, progress, batch, episodes)
+    return batch.rewards.numpy()
+
+
+def at_the_end(rewards):
+    """The rewards of the last steps (N,); there are no others."""
+    assert np.count_nonzero(rewards - np.diag(np.diag(rewards))) == 0
+    return np.diag(rewards)
+
+
+def residuals(episodes, who=slice(None)):
+    """Masses and R_terminal less what a linear function of the errors says of them, by least squares."""
+    x = np.column_stack([np.ones(len(episodes["error"][who])), 1e3 * episodes["error"][who]])
+    ends = np.column_stack([episodes["final_mass_kg"], terminal_reward(episodes["error_norm"], 0.002)])[who]
+    return (ends - x @ np.linalg.lstsq(x, ends, rcond=1e-9)[0]).T
+
+
+def test_residuals_in_units_of_the_terminal_rewards():
+    episodes = flights()
+    mass, terminal = residuals(episodes)
+    expected = 2.0 * terminal.std() / mass.std() * mass * 0.2  # --mass-weight, --reward-scale
+    np.testing.assert_allclose(at_the_end(paid(episodes)), expected, rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(at_the_end(paid(episodes, mass_weight=0.5)), expected / 4, rtol=1e-5, atol=1e-7)
+
+
+def test_what_a_miss_saves_and_kilograms_do_not_count():
+    episodes = flights()
+    before = paid(episodes)
+    saved = episodes["error"] @ np.array([7e3, 0.0, -13e3, 6e3, 6e3, 3e3])  # 18 t a unit, as in ascents
+    lower = episodes | {"final_mass_kg": 2 * (episodes["final_mass_kg"] + saved) - 5000}
+    np.testing.assert_allclose(paid(lower), before, rtol=1e-5, atol=1e-7)
+
+
+def test_flights_off_to_one_side_are_paid_little():
+    """There R_terminal is close to linear in the errors; what it scatters by beyond that is what masses are paid in."""
+    near, off = flights(size=1e-4), flights(size=1e-4)
+    off["error"] = off["error"] + 0.01 / np.sqrt(6)
+    off["error_norm"] = np.linalg.norm(off["error"], axis=1)
+    assert np.abs(paid(off)).max() < 0.1 * np.abs(paid(near)).max()
+
+
+def test_far_flights_take_no_part():
+    episodes = flights()
+    mass, terminal = residuals(episodes, slice(4, None))
+    episodes["error"][:4] += 1.0
+    episodes["error_norm"] = np.linalg.norm(episodes["error"], axis=1)
+    rewards = at_the_end(paid(episodes))
+    assert not rewards[:4].any()
+    np.testing.assert_allclose(rewards[4:], 0.4 * terminal.std() / mass.std() * mass, rtol=1e-5, atol=1e-7)
+    episodes["error_norm"][4:20] = 0.06
+    assert not paid(episodes).any(), "fewer than half of them say little"
+
+
+@pytest.mark.parametrize(
+    ("progress", "share"), [(0.0, 0), (0.1, 0), (0.15, 0.5), (0.5, 1), (0.675, 0.5), (0.85, 0), (1, 0)]
+)
+def test_course(progress, share):
+    np.testing.assert_allclose(paid(flights(), progress), share * paid(flights(), 0.3), rtol=1e-5, atol=1e-7)
+
+
+def test_a_fixed_final_time_pays_nothing():
+    assert not paid(flights(), env_id="RocketAscent-v0").any()
+
+
+def test_groups_of_one_draw_are_compared_among_themselves():
+    """Another draw may have any mass and save another mass by a miss."""
+    episodes, flags = flights(), {"dispersion": 1.0, "flights_per_start": 16}
+    before = paid(episodes, **flags)
+    other = np.arange(N) >= 16
+    episodes["final_mass_kg"] += other * (300 + episodes["error"] @ np.full(6, 5e3))
+    np.testing.assert_allclose(paid(episodes, **flags), before, rtol=1e-5, atol=1e-7)
+    for group in (slice(16), slice(16, None)):
+        mass, terminal = residuals(episodes, group)
+        np.testing.assert_allclose(
+            at_the_end(before)[group], 0.4 * terminal.std() / mass.std() * mass, rtol=1e-5, atol=1e-7
+        )
+
+
+def test_equal_masses_are_no_division_by_zero():
+    """Flights that burn to the end without reaching the energy all have the same."""
+    rewards = paid(flights() | {"final_mass_kg": np.full(N, 6644.0)})
+    assert np.abs(rewards).max() < 1e-3
+
+
+@pytest.mark.parametrize("dispersion", [0.0, 1.0])
+def test_several_processes_pay_what_one_pays(dispersion, monkeypatch):
+    """Each its own flights, by the fit to all flights of one start; 8 of 32 are the first process's."""
+    episodes, flags = flights(), {"dispersion": dispersion, "flights_per_start": 8}
+    whole = at_the_end(paid(episodes, **flags))
+    monkeypatch.setattr(script.runs, "gathered", lambda count: [8, 24])
+    for rank, part in ((0, slice(8)), (1, slice(8, None))):
+        monkeypatch.setattr(script.runs, "process", lambda rank=rank: (rank, 2))
+        rewards = at_the_end(paid(episodes, flying=len(whole[part]), **flags))
+        np.testing.assert_array_equal(rewards, whole[part])
