@@ -91,7 +91,7 @@ def rocket_headline(metrics: dict) -> str:
     if "mass_ratio_reached" in metrics:
         best = f"optimum for the orbit reached {metrics['reference_mass_reached_kg']:.1f} kg"
     mass = f"final mass {metrics['final_mass_kg']:.1f} kg, {best}"
-    return f"{metrics['env_id']}: ||error|| {metrics['error_norm']:.5f}, {mass}{crash}"
+    return f"{metrics['env_id']}: ||error|| {metrics['error_norm']:.6f}, {mass}{crash}"
 
 
 def draw_training(curves: list[dict], metrics: dict) -> Figure:

@@ -62,7 +62,7 @@ class Args:
     memory_length: int = 32  # memory length L: a step attends to itself and the L steps before it
     mlp_dim: int = 128  # width of the position-wise MLP
     hidden_dim: int = 128  # width of the hidden layer of each head
-    memory_noise: float = 0.1  # spread of the memory before an episode's start (Algorithm 1, line 5; the value is ours)
+    memory_noise: float = 0.1  # spread of the memory before an episode (Algorithm 1, line 5; the value is ours)
 
     # PPO (Table 1 where it has a row; docs/decisions.md has the rest)
     total_updates: int = 1000  # number of updates

@@ -807,6 +807,22 @@ def terminal_reward(error_norm, scale=TERMINAL_SCALE):
     return -2.0 * np.log1p(error_norm / scale)
 
 
+def mass_reward(mass, error, terminal):
+    """What flights of one start are paid for the mass (n,) left beyond what their terminal errors (n, 6) saved: (n,).
+
+    A low perigee saves 18 t a unit of ||error||, which is for R_terminal to judge. So the masses are regressed linearly
+    on the errors, which have four directions at a given energy: the residuals are what there is to gain in the same
+    orbit. In kilograms they fall with the noise; R_terminal's scatter does not, and would hide them. So their unit is
+    what R_terminal, `terminal` (n,), scatters by beyond its own regression: little while the orbit is off to one side,
+    and the errors matter linearly. Only in training; ours.
+    """
+    ends = np.column_stack([mass, terminal])
+    x, y = (values - values.mean(axis=0) for values in (error, ends))
+    directions = np.linalg.svd(x, full_matrices=False)[0][:, :4]
+    gain, rest = (y - directions @ (directions.T @ y)).T
+    return rest.std() * gain / max(gain.std(), 1e-9)
+
+
 def precision_points(error_norm):
     """2000 1[d < 0.02] + 1600 e^(-d/0.01) + 1600 e^(-d/0.001), d as in `terminal_reward`: reported only.
 

@@ -462,7 +462,7 @@ def test_ascent_figure_shows_both_flights(flown, env_id):
     dropped = " ".join(text.get_text() for text in panels["(a) mass (t)"].texts)
     assert all(f"{end:g} s: {text} dropped" in dropped for end, text in STAGINGS[env_id].items())
     title = figure.get_suptitle()
-    assert f"{metrics['error_norm']:.5f}" in title and f"{metrics['final_mass_kg']:.1f} kg" in title
+    assert f"{metrics['error_norm']:.6f}" in title and f"{metrics['final_mass_kg']:.1f} kg" in title
     assert all(ax.get_xlabel() for ax in figure.axes if "velocity" not in ax.get_ylabel())
 
 
