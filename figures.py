@@ -98,7 +98,7 @@ def draw_training(curves: list[dict], metrics: dict) -> Figure:
     """Reward, policy loss, total loss and the mean action's miss over the samples.
 
     With several seeds each is thin and their median thick. The miss is ||error|| or the cost over the optimum's less 1.
-    A rocket's reward is that of the mean action: the sampled flights pay prices that change during the training.
+    A rocket's reward is that of the mean action, without the noise that changes during the training.
     """
     losses = {"losses/policy_loss": "policy loss", "losses/total_loss": "total loss"}
     panels = {"charts/episodic_return": "episodic return"} | losses

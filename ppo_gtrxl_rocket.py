@@ -57,7 +57,7 @@ class Args:
     observe_mass: bool = False  # show the true mass of a dispersed rocket, not the flight computer's
     action_frame: str = "local"  # the thrust direction's axes: local (up, along-track, cross-track) or eci
     guidance: str = "none"  # in training: early reference pitch of R_guidance: none (R_guidance is 0), linear or knots
-    mass_weight: float = 2.0  # cut-off: factor on `mass_reward`
+    mass_weight: float = 2.0  # cut-off: factor on `mass_reward` (paid where 8 or more flights have the same start)
     reward_scale: float = 0.2  # factor on the rewards in training; everything logged is unscaled
 
     # transformer (a laptop's; docs/decisions.md has Table 1's beside ours)
@@ -169,7 +169,8 @@ def mean_action(output, action_scale):
 def shape_rewards(envs, args, progress, batch, episodes):
     """With cut-off, pay a flight's last step for its `mass_reward` among the flights of its start, or draw; ours.
 
-    Far from the target flights say little of what a miss saves. At the end of the training the orbit alone counts.
+    Among those near the target: others say little of what a miss saves. They must be half of all, and eight. All of it
+    from 20 to 50 % of the updates, nothing before 10 % and in the last 15 %.
     """
     weight = envs.cutoff * args.mass_weight * np.interp(progress, [0.1, 0.2, 0.5, 0.85], [0.0, 1.0, 1.0, 0.0])
     if not weight:

@@ -808,13 +808,13 @@ def terminal_reward(error_norm, scale=TERMINAL_SCALE):
 
 
 def mass_reward(mass, error, terminal):
-    """What flights of one start are paid for the mass (n,) left beyond what their terminal errors (n, 6) saved: (n,).
+    """Rewards (n,) of flights of one start for the mass that they have left, apart from what their misses saved; ours.
 
-    A low perigee saves 18 t a unit of ||error||, which is for R_terminal to judge. So the masses are regressed linearly
-    on the errors, which have four directions at a given energy: the residuals are what there is to gain in the same
-    orbit. In kilograms they fall with the noise; R_terminal's scatter does not, and would hide them. So their unit is
-    what R_terminal, `terminal` (n,), scatters by beyond its own regression: little while the orbit is off to one side,
-    and the errors matter linearly. Only in training; ours.
+    A low perigee saves propellant (the paper's rocket: 18 t a unit of ||error||), which is R_terminal's to judge. So
+    mass (n,) and R_terminal, `terminal` (n,), are each regressed linearly on the terminal errors (n, 6), which have
+    four directions where all flights end at the target's energy. The mass's residuals are paid, scaled to the spread of
+    R_terminal's: kilograms would fall with the noise and be hidden by R_terminal, whose spread does not. While the
+    orbit is off to one side, R_terminal is nearly linear in the errors, and little is paid. Only in training.
     """
     ends = np.column_stack([mass, terminal])
     x, y = (values - values.mean(axis=0) for values in (error, ends))

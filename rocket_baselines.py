@@ -195,10 +195,10 @@ def interpolate(times, t, values):
 
 @contextmanager
 def interruptible():
-    """What the handler of SIGINT or SIGTERM raised in the block leaves it: KeyboardInterrupt, if nobody changed it.
+    """Raise at the block's end what a handler of SIGINT or SIGTERM raised within it, even where CasADi swallowed it.
 
-    CasADi would take it for one more failure of IPOPT, return nothing, raise a RuntimeError, or, where it tries an
-    argument's types, pass over it.
+    That is KeyboardInterrupt by default. CasADi takes it for one more failure of IPOPT, returns nothing, raises a
+    RuntimeError, or, where it tries an argument's types, passes over it.
     """
     raised: list[BaseException] = []
 

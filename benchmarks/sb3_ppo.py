@@ -70,7 +70,7 @@ class OurCurriculum(BaseCallback):
     """Before each rollout, what our script changes by the share of training done, and the price of propellant.
 
     Ours compares the masses of flights that have all ended (`shape_rewards`). This library's rollouts end in the midst
-    of flights, so here propellant costs by the kilogram, as it did in our script until 20f94d3: nothing in the first
+    of flights, so here propellant costs by the kilogram, as it did in our script before d1455f1: nothing in the first
     quarter, most at 60 %, a tenth of that at the end.
     """
 

@@ -107,18 +107,18 @@ def measured(result, found):
     """What the cells "optimum" and "here" are of, in their order: (values, digits, unit) each."""
     if result in OTHERS:
         return [([1.0], 0, "")], [(found["ratio_of_sums"], 4, ""), (found["ratio_mean"], 4, "")]
-    optimum, here = [(found["reference_error_norm"], 5, "")], [(found["error_norm"], 5, "")]
+    optimum, here = [(found["reference_error_norm"], 6, "")], [(found["error_norm"], 6, "")]
     if "dispersed_error_median" in found:
         best = json.loads((ROOT / "results" / result / "opponents.json").read_text())["laws"]["optimum"]
         optimum = [([best["dispersed_error_median"]], 5, ""), ([100 * best["dispersed_box_rate"]], 0, " %")]
         here = [(found["dispersed_error_median"], 5, ""), (100 * found["dispersed_box_rate"], 1, " %")]
     elif "mass_ratio_reached" in found:
         optimum += [(found["reference_mass_kg"], 1, " kg")]
-        here += [(found["final_mass_kg"], 1, " kg"), (100 * found["mass_ratio_reached"], 2, " %")]
+        here += [(found["final_mass_kg"], 1, " kg"), (100 * found["mass_ratio_reached"], 3, " %")]
     else:
         rocket = envs.ROCKETS[found["env_id"][0]].rocket
-        here += [(100 * abs(found["a_error_km"]) * 1e3 / rocket.a, 2, " %")]
-        here += [(100 * abs(found["e_error"]) / rocket.e, 2, " %"), (abs(found["i_error_deg"]), 2, "°")]
+        here += [(100 * abs(found["a_error_km"]) * 1e3 / rocket.a, 3, " %")]
+        here += [(100 * abs(found["e_error"]) / rocket.e, 3, " %"), (abs(found["i_error_deg"]), 3, "°")]
     return optimum, here
 
 

@@ -538,7 +538,7 @@ def test_training_figure_shows_the_error_and_no_outlier(flown):
     blue = [line for line in returns.lines if line.get_color() == "tab:blue"][0]
     assert blue.get_ydata()[0] == metrics["reference_episodic_return"]
     last_returns = [line.get_ydata()[-1] for line in returns.lines]
-    assert max(last_returns) > 26, "the evaluations' return, not the training's 20, which pays prices"
+    assert max(last_returns) > 26, "the evaluations' return, not the training's 20, which has its noise"
     assert len(figures.draw_training([curve(evaluations=False)], metrics).axes) == 3
 
 
