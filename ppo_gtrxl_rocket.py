@@ -1,7 +1,7 @@
 """PPO with a Gated Transformer-XL on a four-phase rocket ascent, measured against the true optimum in the same run.
 
     python ppo_gtrxl_rocket.py --seed 1 --guidance knots  # fixed 961 s, as in the paper
-    python ppo_gtrxl_rocket.py --seed 1 --env-id RocketAscentCutoff-v0 --log-std-final -7.4  # free final time
+    python ppo_gtrxl_rocket.py --seed 1 --env-id RocketAscentCutoff-v0  # free final time; README.md has its flags
     python ppo_gtrxl_rocket.py --eval-only --checkpoint results/rocket_fixed/agent.safetensors
 
 Top to bottom: arguments, problem, Gated Transformer-XL, agent, PPO, training, main. From the first
@@ -67,7 +67,7 @@ class Args:
     memory_length: int = 32  # memory length L: a step attends to itself and the L steps before it
     mlp_dim: int = 64  # width of the position-wise MLP
     hidden_dim: int = 64  # width of the hidden layer of each head
-    memory_noise: float = 0.01  # spread of the memory before an episode (Algorithm 1, line 5; the value is ours)
+    memory_noise: float = 0.1  # spread of the memory before an episode (Algorithm 1, line 5; the value is ours)
 
     # PPO (docs/decisions.md has Table 1's beside ours)
     total_updates: int = 500  # number of updates
@@ -88,8 +88,8 @@ class Args:
     target_kl: float | None = 0.02  # the KL divergence from which an update takes no further step (none: no limit)
     lr_schedule: str = "std"  # linear, or std: --learning-rate times the policy's standard deviation
     noise: str = "schedule"  # who sets the log-std: learned (the optimiser) or schedule (linear)
-    log_std: float = -1.0  # initial log of the policy's standard deviation, in the action's unit, -8 to 0.5
-    log_std_final: float = -6.0  # log-std of the last update, where it is not learned to the end
+    log_std: float = -1.4  # initial log of the policy's standard deviation, in the action's unit, -8 to 0.5
+    log_std_final: float = -5.0  # log-std of the last update, where it is not learned to the end
     flights_per_start: int = 32  # flights of each start or draw, compared with one another (1: the paper)
     refine_from: float | None = None  # part of the updates after which the refinement begins (none: never)
     log_std_refine: float | None = None  # log-std at the refinement's beginning (none: as it is)

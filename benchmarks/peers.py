@@ -26,9 +26,8 @@ from memory import cell  # noqa: E402
 from baselines import OneLineParser, integer  # noqa: E402
 
 FOLDER = ROOT / "results" / "peers"
-# the first noise that ours had then, and a tenth of its price of propellant: at 3 it loses the orbit
-AS_OURS = "--log-std -1.4 --mass-weight 0.3"
-CUTOFF = f"--env-id RocketAscentCutoff-v0 --batch-size 512 --learning-rate 1e-3 --samples 7450000 {AS_OURS}"
+LOW_PRICE = "--mass-weight 0.3"  # of the propellant: to the one that ours had, which rose to 3, it loses the orbit
+CUTOFF = f"--env-id RocketAscentCutoff-v0 --batch-size 512 --learning-rate 1e-3 --samples 7450000 {LOW_PRICE}"
 LSTM = "--env-id RocketAscentCutoff-v0 --recurrent --batch-size 3848 --epochs 6 --learning-rate 1e-3 --samples 3700000"
 DI_KEYS = {"ratio_of_sums": "ratio of sums", "ratio_p95": "p95", "hit_rate": "hits"}
 ROCKET_KEYS = {"error_norm": "||error||", "perigee_km": "perigee (km)", "mass_ratio": "mass / optimum"}
@@ -54,7 +53,7 @@ PEERS = {
     "cutoff_low_price": Peer("cut-off, a tenth of it", CUTOFF, ROCKET_KEYS),
     "cutoff_raw": Peer("cut-off, a tenth, raw observations", f"{CUTOFF} --features raw", ROCKET_KEYS),
     "cutoff_longer": Peer("cut-off, a tenth, our minutes", f"{CUTOFF} --samples 14900000", ROCKET_KEYS),
-    "lstm": Peer("LSTM, cut-off, a tenth", f"{LSTM} {AS_OURS}", ROCKET_KEYS, (1,)),
+    "lstm": Peer("LSTM, cut-off, a tenth", f"{LSTM} {LOW_PRICE}", ROCKET_KEYS, (1,)),
     "lstm_dispersed": Peer(
         "LSTM, from there, dispersed",
         f"{LSTM} --dispersion 1 --mass-weight 0.5 --log-std -3.5 --learning-rate 1e-4",  # with 1e-3 it loses the orbit
