@@ -22,7 +22,7 @@ from torch.distributions import Normal
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 import runs
-from envs import ROCKETS, TERMINAL_SCALE, mass_reward, target_constants, terminal_reward
+from envs import DIFFERENCES, ROCKETS, TERMINAL_SCALE, mass_rewards, policy_constants
 from runs import total
 
 
@@ -57,7 +57,7 @@ class Args:
     observe_mass: bool = False  # show the true mass of a dispersed rocket, not the flight computer's
     action_frame: str = "local"  # the thrust direction's axes: local (up, along-track, cross-track) or eci
     guidance: str = "none"  # in training: early reference pitch of R_guidance: none (R_guidance is 0), linear or knots
-    mass_weight: float = 2.0  # cut-off: factor on `mass_reward` (paid where 8 or more flights have the same start)
+    mass_weight: float = 2.0  # cut-off: factor on `mass_rewards` (paid where 8 or more flights have the same start)
     reward_scale: float = 0.2  # factor on the rewards in training; everything logged is unscaled
 
     # transformer (a laptop's; docs/decisions.md has Table 1's beside ours)
@@ -99,19 +99,7 @@ class Args:
 # Problem: what differs from the other scripts -------------------------------------------------------------------------
 ENV_IDS = tuple(ROCKETS)
 ENV_OPTIONS = ("observe_phase", "action_frame", "dispersion", "observe_draw", "observe_mass")  # of the environments
-# sizes by which flights at dispersion 1 differ at the same step: altitude 3 km, climb rate 15 m/s, position and speed
-# out of the plane 0.5 km and 1.5 m/s, speed 30 m/s, the logarithm of the observed mass, angle flown 6 km of arc
-DIFFERENCES = [0.03, 0.015, 0.005, 0.0015, 0.004, 0.003, 0.001]
-
-
-def constants(rocket):
-    """What `features` reads as agent.<name> for a rocket; saved with the weights. Only `mean_flight` is learnt."""
-    steps = rocket.end_time / rocket.dt
-    mean_flight = np.zeros((math.ceil(steps) + 1, len(DIFFERENCES))).tolist()
-    return target_constants(rocket) | {"steps": steps, "differences": DIFFERENCES, "mean_flight": mean_flight}
-
-
-BUFFERS = {env_id: constants(mission.rocket) for env_id, mission in ROCKETS.items()}
+BUFFERS = {env_id: policy_constants(mission.rocket) for env_id, mission in ROCKETS.items()}  # read as agent.<name>
 INITIAL_ACTION = [1.0, 0.0, 0.0]  # straight up: a randomly steered rocket never leaves the ground
 
 
@@ -167,25 +155,14 @@ def mean_action(output, action_scale):
 
 
 def shape_rewards(envs, args, progress, batch, episodes):
-    """With cut-off, pay a flight's last step for its `mass_reward` among the flights of its start, or draw; ours.
-
-    Among those near the target: others say little of what a miss saves. They must be half of all, and eight. All of it
-    from 20 to 50 % of the updates, nothing before 10 % and in the last 15 %.
-    """
+    """With cut-off, pay a flight's last step its `mass_rewards`, all of them from 20 to 50 % of the updates; ours."""
     weight = envs.cutoff * args.mass_weight * np.interp(progress, [0.1, 0.2, 0.5, 0.85], [0.0, 1.0, 1.0, 0.0])
-    if not weight:
-        return
-    mass, error, error_norm = (episodes[name] for name in ("final_mass_kg", "error", "error_norm"))
-    terminal = terminal_reward(error_norm, envs.terminal_scale)
-    near, paid = error_norm < 0.05, np.zeros(len(error))
-    group_size = args.flights_per_start if args.dispersion else len(error)
-    for group in np.arange(len(error)).reshape(-1, group_size):
-        flights = group[near[group]]
-        if len(flights) >= max(8, group_size // 2):
-            paid[flights] = weight * mass_reward(mass[flights], error[flights], terminal[flights])
-    last = batch.alive.sum(0).long() - 1
-    mine = torch.as_tensor(runs.own_part(paid, envs.num_envs) * args.reward_scale)
-    batch.rewards[last, torch.arange(envs.num_envs)] += mine.to(batch.rewards)
+    if weight:
+        group_size = args.flights_per_start if args.dispersion else len(episodes["error"])
+        paid = weight * mass_rewards(episodes, envs.terminal_scale, group_size)
+        last = batch.alive.sum(0).long() - 1
+        mine = torch.as_tensor(runs.own_part(paid, envs.num_envs) * args.reward_scale).to(batch.rewards)
+        batch.rewards[last, torch.arange(envs.num_envs)] += mine
 
 
 def set_curriculum(envs, args, progress, refines, std):

@@ -101,12 +101,15 @@ def kill_and_resume(kills, seed=0):
             seconds = time.time() - before
     for kill in range(kills):
         with tempfile.TemporaryDirectory() as folder:
-            process = start(folder := Path(folder), *argv, slow_disk=kill % 2)
+            process, began = start(folder := Path(folder), *argv, slow_disk=kill % 2), time.time()
             written, moment = f"runs/*/.{rng.choice(['training_state.pt', 'agent.safetensors'])}.*", rng.uniform()
-            time.sleep(seconds * moment)
+            process.join(seconds * moment)
             while kill % 2 and process.is_alive() and not list(folder.glob(written)):
                 time.sleep(0.0005)
-            os.kill(process.pid, signal.SIGKILL) if process.is_alive() else None
+            if process.is_alive():
+                os.kill(process.pid, signal.SIGKILL)
+            else:
+                seconds = time.time() - began  # the machine has become less busy
             process.join()
             saved = list(folder.glob("runs/*/training_state.pt"))
             kind = "after its end" if process.exitcode == 0 else "in a write" if kill % 2 else "at random"

@@ -565,7 +565,7 @@ def test_phases_are_one_hot_whatever_their_number(number):
     burns = tuple(envs.Burn(float(end), ((1, booster),), ((1, booster),)) for end in ends)
     burns = (*burns, envs.Burn((burns[-1].end if burns else 0.0) + 100.0, ((1, one),)))
     rocket = envs.Rocket(burns=burns, end_time=burns[-1].end)
-    agent = SimpleNamespace(**{name: torch.tensor(value) for name, value in ROCKET.constants(rocket).items()})
+    agent = SimpleNamespace(**{name: torch.tensor(value) for name, value in ROCKET.policy_constants(rocket).items()})
     env = envs.RocketVectorEnv(1, envs.Mission(rocket), action_frame="local")
     shown = [env.reset()[0][0, 8], *(env.advance([[1.0, 0.0, 0.0]])[0][0, 8] for _ in range(8))]
     phases = np.unique(shown)
