@@ -820,7 +820,7 @@ def mass_rewards(ends, scale, group_size):
     """Rewards (n,) of flights for the mass that they have left, apart from what their misses saved; only in training.
 
     `ends` are n flights' `final_info`, `scale` that of their R_terminal; each `group_size` in a row have the same start
-    or draw, and are compared if half of them, and eight, are near the target. A low perigee saves propellant (the
+    or draw. Those with ||error|| < 0.05 are compared, if they are half and eight. A low perigee saves propellant (the
     paper's rocket: 18 t a unit of ||error||), which is R_terminal's to judge. So mass and R_terminal are each regressed
     linearly on the terminal errors, which have four directions where all flights end at the target's energy. The mass's
     residuals are paid, scaled to the spread of R_terminal's: kilograms would fall with the noise and be hidden by
