@@ -159,7 +159,7 @@ def shape_rewards(envs, args, progress, batch, episodes):
     weight = envs.cutoff * args.mass_weight * np.interp(progress, [0.1, 0.2, 0.5, 0.85], [0.0, 1.0, 1.0, 0.0])
     if weight:
         group_size = args.flights_per_start if args.dispersion else len(episodes["error"])
-        paid = weight * mass_rewards(episodes, envs.terminal_scale, group_size)
+        paid = weight * mass_rewards(episodes, envs.rocket, envs.terminal_scale, group_size)
         last = batch.alive.sum(0).long() - 1
         mine = torch.as_tensor(runs.own_part(paid, envs.num_envs) * args.reward_scale).to(batch.rewards)
         batch.rewards[last, torch.arange(envs.num_envs)] += mine

@@ -816,18 +816,19 @@ def terminal_reward(error_norm, scale=TERMINAL_SCALE):
     return -2.0 * np.log1p(error_norm / scale)
 
 
-def mass_rewards(ends, scale, group_size):
+def mass_rewards(ends, rocket: Rocket, scale, group_size):
     """Rewards (n,) of flights for the mass that they have left, apart from what their misses saved; only in training.
 
     `ends` are n flights' `final_info`, `scale` that of their R_terminal; each `group_size` in a row have the same start
-    or draw. Those with ||error|| < 0.05 are compared, if they are half and eight. A low perigee saves propellant (the
-    paper's rocket: 18 t a unit of ||error||), which is R_terminal's to judge. So mass and R_terminal are each regressed
-    linearly on the terminal errors, which have four directions where all flights end at the target's energy. The mass's
-    residuals are paid, scaled to the spread of R_terminal's: kilograms would fall with the noise and be hidden by
-    R_terminal, whose spread does not. While the orbit is off to one side, R_terminal is nearly linear in the errors,
-    and little is paid. Ours.
+    or draw. Those with ||error|| < 0.05 whose engine was cut off at the target's energy are compared, if they are half
+    and eight. A low perigee saves propellant (the paper's rocket: 18 t a unit of ||error||), which is R_terminal's to
+    judge. So mass and R_terminal are each regressed linearly on the terminal errors, which have four directions at one
+    energy. The mass's residuals are paid, scaled to the spread of R_terminal's: kilograms would fall with the noise and
+    be hidden by R_terminal, whose spread does not. While the orbit is off to one side, R_terminal is nearly linear in
+    the errors, and little is paid. Ours.
     """
-    near, paid = ends["error_norm"] < 0.05, np.zeros(len(ends["error"]))
+    cut_off = np.abs(1e3 * ends["a_km"] / rocket.a - 1) < 1e-6  # one that ran dry would add a fifth direction
+    near, paid = cut_off & (ends["error_norm"] < 0.05), np.zeros(len(ends["error"]))
     judged = np.column_stack([ends["final_mass_kg"], terminal_reward(ends["error_norm"], scale)])
     for group in np.arange(len(paid)).reshape(-1, group_size):
         flights = group[near[group]]

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import ppo_gtrxl_rocket as script
-from envs import terminal_reward
+from envs import ROCKET, terminal_reward
 
 N = 32
 ENV_ID = "RocketAscentCutoff-v0"
@@ -17,7 +17,8 @@ def flights(seed=0, size=1e-3):
     rng = np.random.default_rng(seed)
     error = size * rng.standard_normal((N, 4)) @ rng.standard_normal((4, 6))
     mass = 7500 + rng.standard_normal(N)
-    return {"error": error, "error_norm": np.linalg.norm(error, axis=1), "final_mass_kg": mass}
+    a_km = np.full(N, ROCKET.a / 1e3)
+    return {"error": error, "error_norm": np.linalg.norm(error, axis=1), "final_mass_kg": mass, "a_km": a_km}
 
 
 def paid(episodes, progress=0.4, env_id=ENV_ID, flying=N, **flags):
@@ -79,6 +80,19 @@ def test_far_flights_take_no_part():
     np.testing.assert_allclose(rewards[4:], 0.4 * terminal.std() / mass.std() * mass, rtol=1e-5, atol=1e-7)
     episodes["error_norm"][4:20] = 0.06
     assert not paid(episodes).any(), "fewer than half of them say little"
+
+
+def test_a_near_flight_that_ran_dry_takes_no_part():
+    """Its error has a fifth direction, which takes one of the four from the others: a low perigee would be paid."""
+    episodes = flights()
+    mass, terminal = residuals(episodes, slice(1, None))
+    ran_dry = {name: values.copy() for name, values in episodes.items()}
+    ran_dry["a_km"][0] *= 0.98
+    ran_dry["error"][0] = 0.01
+    ran_dry["error_norm"][0] = 0.01 * np.sqrt(6)
+    rewards = at_the_end(paid(ran_dry))
+    assert rewards[0] == 0
+    np.testing.assert_allclose(rewards[1:], 0.4 * terminal.std() / mass.std() * mass, rtol=1e-5, atol=1e-7)
 
 
 @pytest.mark.parametrize(
