@@ -63,6 +63,7 @@ class Args:
     mlp_dim: int = 128  # width of the position-wise MLP
     hidden_dim: int = 128  # width of the hidden layer of each head
     memory_noise: float = 0.1  # spread of the memory before an episode (Algorithm 1, line 5; the value is ours)
+    memory_noise_final: float | None = None  # the same in the last update (linear in between; none: --memory-noise)
 
     # PPO (Table 1 where it has a row; docs/decisions.md has the rest)
     total_updates: int = 1000  # number of updates
@@ -484,10 +485,11 @@ def train(args, agent, average, optimizer, envs, run):
         optimizer.param_groups[0]["lr"] = learning_rate
         ent_coef = linear_schedule(args.ent_coef, args.ent_coef_final, progress)
         gae_lambda = linear_schedule(args.gae_lambda, args.gae_lambda_final, progress)  # None: by now --gae-lambda
+        memory_noise = linear_schedule(args.memory_noise, args.memory_noise_final, progress)
         group = set_curriculum(envs, args, progress, refines, std)
 
         # lines 3-13: fly one episode in every environment
-        batch, episodes = rollout(agent, envs, args.reward_scale, args.memory_noise)
+        batch, episodes = rollout(agent, envs, args.reward_scale, memory_noise)
         shape_rewards(envs, args, progress, batch, episodes)
 
         # line 14: advantages, and what the critic learns

@@ -44,7 +44,8 @@ RANGES = {  # lowest and highest value of every numeric flag; NaN and infinity a
     **dict.fromkeys(["total_updates", "num_envs", "num_minibatches", "update_epochs", "radius_curriculum"], (1, 10**6)),
     **dict.fromkeys(["embed_dim", "num_heads", "mlp_dim", "hidden_dim"], (1, 8192)),
     **dict.fromkeys(["learning_rate", "learning_rate_final", "clip_coef"], (0.0, 1.0)),
-    **dict.fromkeys(["gamma", "gae_lambda", "gae_lambda_final", "memory_noise", "refine_from"], (0.0, 1.0)),
+    **dict.fromkeys(["gamma", "gae_lambda", "gae_lambda_final", "refine_from"], (0.0, 1.0)),
+    **dict.fromkeys(["memory_noise", "memory_noise_final"], (0.0, 1.0)),
     **dict.fromkeys(["ent_coef", "ent_coef_final", "vf_coef", "mass_weight"], (0.0, 1e3)),
     **dict.fromkeys(["reward_scale", "max_grad_norm", "target_kl"], (1e-9, 1e9)),
     **dict.fromkeys(["log_std", "log_std_refine", "log_std_final"], (-8.0, 0.5)),
@@ -117,8 +118,9 @@ def parse_args(kind, argv, env_options, buffers):
     check_buffers(args, buffers[args.env_id])
     if args.eval_only and saved and saved["progress"]["seed"] == args.eval_seed and args.env_id in PROBLEMS:
         print(f"--eval-seed {args.eval_seed} is the training's --seed: it may have flown these starts")
-    if args.gae_lambda_final is None:
-        args.gae_lambda_final = args.gae_lambda
+    for name in ("gae_lambda", "memory_noise"):
+        if getattr(args, f"{name}_final") is None:
+            setattr(args, f"{name}_final", getattr(args, name))
     if args.eval_starts is None:
         args.eval_starts = 1000 if args.eval_only else 50
         if getattr(args, "dispersion", 0.0):

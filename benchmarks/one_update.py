@@ -24,8 +24,9 @@ class OneUpdate:
 def script_args(script, **changes):
     """A script's Args as `runs.parse_args` leaves them: a last value that is not given is the first."""
     args = script.Args(**changes)
-    if args.gae_lambda_final is None:
-        args.gae_lambda_final = args.gae_lambda
+    for name in ("gae_lambda", "memory_noise"):
+        if getattr(args, f"{name}_final") is None:
+            setattr(args, f"{name}_final", getattr(args, name))
     return args
 
 

@@ -6,6 +6,7 @@ The scripts' shared sections are the same to the letter (test_scripts.py), so on
 import copy
 import importlib
 import math
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -160,6 +161,28 @@ def test_schedules_half_way(schedules):
     assert schedules(6, **lambdas) == pytest.approx((0.3, 0.95, 1.5e-3))
     assert schedules(11, **lambdas) == pytest.approx((0.1, 1.0, 1e-3))
     assert schedules(6, gae_lambda=0.7)[1] == 0.7
+
+
+def test_memory_noise_half_way(learner, monkeypatch):
+    """What `rollout` is asked for in the first, the middle and the last of 11 updates."""
+
+    class Asked(Exception):
+        pass
+
+    def rollout(agent, envs, reward_scale, memory_noise):
+        raise Asked(memory_noise)
+
+    def of_update(iteration, **changes):
+        run, start = learner(total_updates=11, **changes), SimpleNamespace(updates_done=iteration - 1)
+        with monkeypatch.context() as patch, pytest.raises(Asked) as asked:
+            patch.setattr(script, "set_curriculum", lambda *inputs: 1)
+            patch.setattr(script, "rollout", rollout)
+            script.train(run.args, run.agent, run.average, run.optimizer, run.envs, start)
+        return asked.value.args[0]
+
+    falling = {"memory_noise": 0.2, "memory_noise_final": 0.0}
+    assert [of_update(iteration, **falling) for iteration in (1, 6, 11)] == pytest.approx([0.2, 0.1, 0.0])
+    assert of_update(6, memory_noise=0.2) == 0.2
 
 
 @pytest.mark.parametrize("log_std", [0.0, -1.5, -8.0])

@@ -213,7 +213,7 @@ def test_flags_of_the_interface():
     words += (
         " num_threads torch_compile noise log_std_final gae_lambda_final lr_schedule memory_noise flights_per_start"
     )
-    words += " refine_from log_std_refine observe_velocity"
+    words += " refine_from log_std_refine observe_velocity memory_noise_final"
     fields = {script: {field.name for field in dataclasses.fields(script.Args)} for script in MODULES}
     family_only = {"radius_curriculum", "observe_velocity"}
     assert all(set(words.split()) <= fields[script] | family_only for script in fields)
