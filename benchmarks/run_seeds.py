@@ -4,8 +4,8 @@
 
 Each line of jobs.txt is a results folder and the command that trains for it; empty lines and # comments are skipped:
 
-    results/rocket_fixed  ppo_gtrxl_rocket.py --seed 1 --num-threads 1 --guidance knots
-    results/rocket_fixed  ppo_gtrxl_rocket.py --seed 2 --num-threads 1 --guidance knots
+    results/my_di  ppo_gtrxl_di.py --seed 1 --num-threads 1
+    results/my_di  ppo_gtrxl_di.py --seed 2 --num-threads 1
 
 With --numbers the results folders get the evaluations and curves alone: no weights, no figures.
 
