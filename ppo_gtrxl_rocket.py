@@ -1,6 +1,6 @@
 """PPO with a Gated Transformer-XL on a four-phase rocket ascent, measured against the true optimum in the same run.
 
-    python ppo_gtrxl_rocket.py --seed 1 --guidance knots  # fixed 961 s, as in the paper
+    python ppo_gtrxl_rocket.py --seed 1  # fixed 961 s, as in the paper; results/rocket_fixed/README.md has its flags
     python ppo_gtrxl_rocket.py --seed 1 --env-id RocketAscentCutoff-v0  # free final time; README.md has its flags
     python ppo_gtrxl_rocket.py --eval-only --checkpoint results/rocket_fixed/agent.safetensors
 

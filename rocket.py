@@ -820,14 +820,15 @@ def mass_rewards(ends, rocket: Rocket, scale, group_size):
     """Rewards (n,) of flights for the mass that they have left, apart from what their misses saved; only in training.
 
     `ends` are n flights' `final_info`, `scale` that of their R_terminal; each `group_size` in a row have the same start
-    or draw. Those with ||error|| < 0.05 whose engine was cut off at the target's energy are compared, if they are half
-    and eight. A low perigee saves propellant (the paper's rocket: 18 t a unit of ||error||), which is R_terminal's to
-    judge. So mass and R_terminal are each regressed linearly on the terminal errors, which have four directions at one
-    energy. The mass's residuals are paid, scaled to the spread of R_terminal's: kilograms would fall with the noise and
-    be hidden by R_terminal, whose spread does not. While the orbit is off to one side, R_terminal is nearly linear in
-    the errors, and little is paid. Ours.
+    or draw. Those that end with ||error|| < 0.05 at the target's energy are compared, where they are at least eight and
+    half of the group: what runs dry, or has too much energy before the last burn, gets nothing. A low perigee saves
+    propellant (the paper's rocket: 18 t a unit of ||error||), which is R_terminal's to judge. So mass and R_terminal
+    are each regressed linearly on the terminal errors, which have four directions at one energy. The mass's residuals
+    are paid, scaled to the spread of R_terminal's: kilograms would fall with the noise and be hidden by R_terminal,
+    whose spread does not. While the orbit is off to one side, R_terminal is nearly linear in the errors, and little is
+    paid. Ours.
     """
-    cut_off = np.abs(1e3 * ends["a_km"] / rocket.a - 1) < 1e-6  # one that ran dry would add a fifth direction
+    cut_off = np.abs(1e3 * ends["a_km"] / rocket.a - 1) < 1e-6  # others would add a fifth direction
     near, paid = cut_off & (ends["error_norm"] < 0.05), np.zeros(len(ends["error"]))
     judged = np.column_stack([ends["final_mass_kg"], terminal_reward(ends["error_norm"], scale)])
     for group in np.arange(len(paid)).reshape(-1, group_size):

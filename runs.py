@@ -118,14 +118,19 @@ def parse_args(kind, argv, env_options, buffers):
     check_buffers(args, buffers[args.env_id])
     if args.eval_only and saved and saved["progress"]["seed"] == args.eval_seed and args.env_id in PROBLEMS:
         print(f"--eval-seed {args.eval_seed} is the training's --seed: it may have flown these starts")
-    for name in ("gae_lambda", "memory_noise"):
-        if getattr(args, f"{name}_final") is None:
-            setattr(args, f"{name}_final", getattr(args, name))
+    fill_last_values(args)
     if args.eval_starts is None:
         args.eval_starts = 1000 if args.eval_only else 50
         if getattr(args, "dispersion", 0.0):
             args.eval_starts = evaluate.DISPERSED_STARTS
     return args, saved
+
+
+def fill_last_values(args):
+    """A last value that is not given is the first."""
+    for name in ("gae_lambda", "memory_noise"):
+        if getattr(args, f"{name}_final") is None:
+            setattr(args, f"{name}_final", getattr(args, name))
 
 
 def read_checkpoint(args, kind, typed, env_options, buffers):
@@ -560,7 +565,9 @@ def load_state(run_dir, kind, env_ids):
         if damaged:
             raise ValueError(f"{damaged} is damaged")
         state = torch.load(path, map_location="cpu", weights_only=True)
-        args, kinds = state["args"], get_type_hints(kind)
+        came_later = {name: value for name, value in vars(kind()).items() if value is None}  # and changes nothing
+        args = state["args"] = {**came_later, **state["args"]}
+        kinds = get_type_hints(kind)
         if args["env_id"] not in env_ids:
             raise ValueError(f"it is of {args['env_id']}; this script takes {', '.join(env_ids)}")
         if args.keys() != kinds.keys():

@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import sys
+from pathlib import Path
 from unittest import mock
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+import runs  # noqa: E402
 
 
 class UpdateDone(Exception):
@@ -24,9 +29,7 @@ class OneUpdate:
 def script_args(script, **changes):
     """A script's Args as `runs.parse_args` leaves them: a last value that is not given is the first."""
     args = script.Args(**changes)
-    for name in ("gae_lambda", "memory_noise"):
-        if getattr(args, f"{name}_final") is None:
-            setattr(args, f"{name}_final", getattr(args, name))
+    runs.fill_last_values(args)
     return args
 
 

@@ -796,6 +796,26 @@ def test_resume_of_a_run_that_began_from_a_checkpoint(trained, fresh_folder, mon
     assert_same_bits(resumed, state_of(run_folder()))
 
 
+def test_a_last_value_that_is_not_given_is_the_first():
+    assert parse("--memory-noise=0.3").memory_noise_final == 0.3
+    assert parse("--memory-noise-final=0").memory_noise_final == 0
+    assert parse("--gae-lambda=0.7").gae_lambda_final == 0.7
+    assert parse("--gae-lambda-final=0").gae_lambda_final == 0
+
+
+def test_resume_of_a_run_from_before_a_flag(uninterrupted, fresh_folder, monkeypatch):
+    """A flag that came later and is not given by default changes nothing."""
+    fresh_folder("older")
+    stop_in_update(monkeypatch, 3, KeyboardInterrupt())
+    with pytest.raises(KeyboardInterrupt):
+        DI.main([*TINY, "--total-updates=4"])
+    path = run_folder() / "training_state.pt"
+    state = torch.load(path, weights_only=True)
+    del state["args"]["memory_noise_final"]
+    torch.save(state, path)
+    assert_resumes(uninterrupted)
+
+
 REFINES = [*NETWORK, "--num-envs=4", "--num-minibatches=2", "--update-epochs=2", "--eval-starts=10"]
 REFINES += ["--flights-per-start=2", "--refine-from=0.5", "--total-updates=4"]
 
