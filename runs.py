@@ -565,7 +565,8 @@ def load_state(run_dir, kind, env_ids):
         if damaged:
             raise ValueError(f"{damaged} is damaged")
         state = torch.load(path, map_location="cpu", weights_only=True)
-        came_later = {name: value for name, value in vars(kind()).items() if value is None}  # and changes nothing
+        # a flag that came after this run changes nothing where its default is None; any other is refused below
+        came_later = {name: value for name, value in vars(kind()).items() if value is None}
         args = state["args"] = {**came_later, **state["args"]}
         kinds = get_type_hints(kind)
         if args["env_id"] not in env_ids:
