@@ -52,7 +52,7 @@ PEERS = {
     "cutoff": Peer("cut-off, our former price", f"{CUTOFF} --mass-weight 3", ROCKET_KEYS),
     "cutoff_low_price": Peer("cut-off, a tenth of it", CUTOFF, ROCKET_KEYS),
     "cutoff_raw": Peer("cut-off, a tenth, raw observations", f"{CUTOFF} --features raw", ROCKET_KEYS),
-    "cutoff_longer": Peer("cut-off, a tenth, our minutes", f"{CUTOFF} --samples 14900000", ROCKET_KEYS),
+    "cutoff_longer": Peer("cut-off, a tenth, twice the samples", f"{CUTOFF} --samples 14900000", ROCKET_KEYS),
     "lstm": Peer("LSTM, cut-off, a tenth", f"{LSTM} {LOW_PRICE}", ROCKET_KEYS, (1,)),
     "lstm_dispersed": Peer(
         "LSTM, from there, dispersed",
