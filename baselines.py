@@ -10,8 +10,8 @@
 
 Each prints mean costs over random starts and what they are compared with; a rocket has one start.
 Reading order: linear-quadratic optimum, nonlinear programs, references, command line; the rockets' optima are in
-`rocket_baselines.py`, all its names are also this module's. CasADi and SciPy are imported only where they are used: in a
-training that is at its start, where it solves the optimum that its evaluations fly.
+`rocket_baselines.py`, all its names are also this module's. CasADi and SciPy are imported only where they are used:
+in a training at its start, when it solves the optimum that its evaluations fly.
 """
 
 from __future__ import annotations
