@@ -29,18 +29,27 @@ def read_logs(folder):
     return [path.read_text() for path in folder.glob("runs/results_tiny_seed_*.log")]
 
 
-@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
-def test_run_seeds_survives_a_restart(tmp_path, signum):
-    """Two seeds, interrupted once both train; the second start goes on with both, the third has nothing to do."""
+def interrupted(folder, signum):
+    """The lines of two jobs that got the signal once both trained."""
     lines = [f"results/tiny ppo_gtrxl_di.py --seed {seed} --total-updates 150 {TINY}  # seed {seed}" for seed in (1, 2)]
-    first = start(tmp_path, ["# two seeds", "", *lines])
-    while first.poll() is None and sum("update 1/150" in log for log in read_logs(tmp_path)) < 2:
+    process = start(folder, ["# two seeds", "", *lines])
+    while process.poll() is None and sum("update 1/150" in log for log in read_logs(folder)) < 2:
         time.sleep(0.02)
-    first.send_signal(signum)
-    first.communicate(timeout=60)
-    assert first.returncode == 128 + signum and not list(tmp_path.glob("runs/*/eval.json"))
-    logs = read_logs(tmp_path)
+    process.send_signal(signum)
+    process.communicate(timeout=60)
+    assert process.returncode == 128 + signum and not list(folder.glob("runs/*/eval.json"))
+    logs = read_logs(folder)
     assert len(logs) == 2 and all("stopped after update" in log for log in logs), "what it started, it ended"
+    return lines
+
+
+def test_sigterm_ends_what_was_started(tmp_path):
+    interrupted(tmp_path, signal.SIGTERM)
+
+
+def test_run_seeds_survives_a_restart(tmp_path):
+    """Two seeds, stopped by Ctrl-C; the second start goes on with both, the third has nothing to do."""
+    lines = interrupted(tmp_path, signal.SIGINT)
     second = start(tmp_path, lines)
     output, errors = second.communicate(timeout=120)
     assert second.returncode == 0, errors
