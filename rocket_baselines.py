@@ -201,6 +201,7 @@ def interruptible():
     RuntimeError, or, where it tries an argument's types, passes over it.
     """
     raised: list[BaseException] = []
+    within = True  # a signal that comes while the handlers are put back waits for that
 
     def noted(handler):
         def note(signum, frame):
@@ -208,7 +209,8 @@ def interruptible():
                 handler(signum, frame)
             except BaseException as error:
                 raised.append(error)
-                raise
+                if within:
+                    raise
 
         return note
 
@@ -224,6 +226,7 @@ def interruptible():
         if not raised:
             raise
     finally:
+        within = False
         for signum, handler in handlers.items():
             signal.signal(signum, handler)
     if raised:

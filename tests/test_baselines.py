@@ -173,6 +173,23 @@ def test_what_a_handler_raised_is_raised_at_the_end(passed_over):
         signal.signal(signal.SIGTERM, before)
 
 
+def test_a_signal_while_the_handlers_are_put_back(monkeypatch):
+    put = signal.signal
+
+    def late(signum, handler):
+        if handler is signal.default_int_handler:
+            signal.raise_signal(signal.SIGINT)
+        return put(signum, handler)
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt), interruptible():
+            monkeypatch.setattr(signal, "signal", late)
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        put(signal.SIGINT, before)
+
+
 def test_a_block_without_a_signal_keeps_its_own_errors():
     with pytest.raises(ZeroDivisionError), interruptible():
         raise ZeroDivisionError
