@@ -118,7 +118,8 @@ def features(agent, obs):
     """What the encoder sees of observations (..., 9 or more): the state in the target orbit's axes, and its error.
 
     h = r x v, e = v x h - r / |r| (mu = 1), error = [(h - h_T) / |h_T|, e - e_T], also as tanh(10 error): small ones
-    are seen. So is the little that this flight differs by from the mean of all at this step. All but the state is ours.
+    are seen. So is the little that this flight differs by from the mean of all at this step: linear, for at the cut-off
+    it is several times its size at first, and the perigee is in sums of it. All but the state is ours.
     """
     r, v, compared = motion(agent, obs)
     t_norm, phase = obs[..., 7:8], obs[..., 8:9]  # phase: 0 to 1, one of agent.phases (the paper's 0 to 3)
@@ -128,7 +129,7 @@ def features(agent, obs):
     one_hot = ((phase - agent.phases).abs() < 1e-3).to(obs.dtype)
     step = ((1 - t_norm[..., 0]) * agent.steps).round().long().clamp(max=len(agent.mean_flight) - 1)
     mean = agent.mean_flight[step]  # zeros until there has been a flight to compare with
-    differs = mean.any(dim=-1, keepdim=True) * ((compared - mean) / agent.differences).tanh()
+    differs = mean.any(dim=-1, keepdim=True) * ((compared - mean) / agent.differences).clamp(-10, 10)
     state = [r, v, compared[..., :5], t_norm, compared[..., 5:6], one_hot, error, (10 * error).tanh()]
     return torch.cat([*state, obs[..., 9:], differs], dim=-1)  # behind the nine: the draw, with --observe-draw
 
@@ -169,8 +170,8 @@ def shape_rewards(envs, args, progress, batch, episodes):
 def set_curriculum(envs, args, progress, refines, std):
     """What only training changes, all of it ours; returns how many flights in a row have the same start, or draw.
 
-    Noise std scatters the ends of the flights by about std / 10: R_terminal need not be steeper; dispersed ones end
-    some 0.001 apart whatever the noise.
+    Noise std scatters the ends of the flights by about std / 10: R_terminal need not be steeper. On dispersed flights
+    it stays at 0.001: a smaller scale was no better.
     """
     envs.guidance = args.guidance
     envs.terminal_scale = min(TERMINAL_SCALE, max(std / 8, 0.001 if args.dispersion else 0.0))

@@ -722,8 +722,9 @@ def local_frame(y, normal):
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-# sizes by which flights at dispersion 1 differ at the same step: altitude 3 km, climb rate 15 m/s, position and speed
-# out of the plane 0.5 km and 1.5 m/s, speed 30 m/s, the logarithm of the observed mass, angle flown 6 km of arc
+# sizes by which flights at dispersion 1 differ at the same step (at the cut-off by up to four times that): altitude
+# 3 km, climb rate 15 m/s, position and speed out of the plane 0.5 km and 1.5 m/s, speed 30 m/s, the logarithm of the
+# observed mass, angle flown 6 km of arc
 DIFFERENCES = [0.03, 0.015, 0.005, 0.0015, 0.004, 0.003, 0.001]
 
 

@@ -82,7 +82,7 @@ def test_without_dispersion_nothing_is_learnt(flights):
 
 
 def test_what_is_seen_of_a_flight_beside_the_mean(flights):
-    """tanh of the difference over its size; nothing where no flight has been, and the last step's mean after it."""
+    """The difference over its size, at most 10; nothing where no flight has been, and the last step's mean after it."""
     agent, args = make_agent()
     rocket, t = ROCKETS[CUTOFF].rocket, 30
     assert not script.features(agent, flights.obs)[..., -7:].any()
@@ -91,7 +91,7 @@ def test_what_is_seen_of_a_flight_beside_the_mean(flights):
     assert seen.shape == (60, 8, 36)
     mean = np.mean([compared(flights.obs[t, k].numpy(), rocket) for k in range(3)], axis=0)
     for k in range(8):
-        expected = np.tanh((compared(flights.obs[t, k].numpy(), rocket) - mean) / SCALES)
+        expected = np.clip((compared(flights.obs[t, k].numpy(), rocket) - mean) / SCALES, -10, 10)
         np.testing.assert_allclose(seen[t, k, -7:], expected, atol=2e-4)
     assert seen[t, :, -7:].std() > 0.1  # dispersed flights are told apart
     far = flights.obs[t, :1].clone()
@@ -99,10 +99,14 @@ def test_what_is_seen_of_a_flight_beside_the_mean(flights):
     assert not script.features(agent, far)[..., -7:].any()
     far[..., 7] = -0.1  # later than the nominal vehicle could fly
     agent.mean_flight[-1] = torch.tensor(compared(far[0].numpy(), rocket)) - 0.5 * torch.tensor(SCALES)
-    np.testing.assert_allclose(script.features(agent, far)[0, -7:], np.tanh(0.5), atol=1e-3)
+    np.testing.assert_allclose(script.features(agent, far)[0, -7:], 0.5, atol=1e-3)
+    agent.mean_flight[-1] -= 4.0 * torch.tensor(SCALES)  # what grows to the cut-off stays linear, and so do sums of it
+    np.testing.assert_allclose(script.features(agent, far)[0, -7:], 4.5, atol=1e-3)
+    agent.mean_flight[-1] -= 40.0 * torch.tensor(SCALES)  # as where one flight has dropped a stage and the mean has not
+    np.testing.assert_array_equal(script.features(agent, far)[0, -7:], 10.0)
 
 
-def test_a_flight_three_kilometres_higher_reads_tanh_one(flights):
+def test_a_flight_three_kilometres_higher_reads_one(flights):
     """The sizes are what their comment says they are."""
     agent, args = make_agent()
     rocket = ROCKETS[CUTOFF].rocket
@@ -111,7 +115,7 @@ def test_a_flight_three_kilometres_higher_reads_tanh_one(flights):
     agent.mean_flight[30] = torch.tensor(compared(y, rocket))
     y[:3] += 3000 * 6378145 / 6.4e6 * up[:, 0]  # 64: the unit of length is 99.66 km
     seen = script.features(agent, torch.as_tensor(y)[None])[0, -7:]
-    assert seen[0] == pytest.approx(np.tanh(1.0), abs=1e-3)
+    assert seen[0] == pytest.approx(1.0, abs=1e-3)
     assert seen[5:].abs().max() < 1e-3 and seen[3] == pytest.approx(0.0, abs=1e-3)
 
 
