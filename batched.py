@@ -45,9 +45,9 @@ class BatchedEnv(VectorEnv):
 
     With the attribute `flights_per_start` G, to be set before a `reset` and only in training, environment k flies start
     k // G, so that flights differ by their actions alone (1: each flies its own start; the last group is smaller where
-    G does not divide N). A dispersed rocket's start is its vehicle and air. This is promised of the episodes that begin
-    at a `reset`, and our scripts train on no others: an autoreset groups the environments that ended in its step,
-    whatever their k.
+    G does not divide N). A dispersed rocket's start is its vehicle and air; of two groups the second has the first
+    one's draw, its signs changed (antithetic variates). This is promised of the episodes that begin at a `reset`, and
+    our scripts train on no others: an autoreset groups the environments that ended in its step, whatever their k.
     """
 
     metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}

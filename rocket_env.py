@@ -196,8 +196,7 @@ class RocketVectorEnv(BatchedEnv):
         New ones are `flights_per_start` environments' each, in the order of those in `mask`.
         """
         if given is None:
-            scores = lambda n: self.np_random.standard_normal((n, self.draw.shape[1]))  # noqa: E731
-            draw = np.clip(self._draw_starts(scores, int(mask.sum())), -self._draw_bounds, self._draw_bounds)
+            draw = np.clip(self._draw_starts(self._scores, int(mask.sum())), -self._draw_bounds, self._draw_bounds)
         else:
             draw = self._checked_draw(given)[mask]
         drawn = draw_vehicles(self.rocket, self.dispersion, draw)  # before anything is changed: it may be refused
@@ -205,6 +204,14 @@ class RocketVectorEnv(BatchedEnv):
         for mine, new in zip(self.vehicles, drawn):
             mine[..., mask] = new
         self.episode_steps = max(self.episode_steps, int(self._set_ends(self.vehicles).max()))
+
+    def _scores(self, n):
+        """Standard scores (n, k). Those of groups come in pairs, z and -z: few draws then have no mean of their own."""
+        size = self.draw.shape[1]
+        if self.flights_per_start == 1:
+            return self.np_random.standard_normal((n, size))
+        half = self.np_random.standard_normal((-(-n // 2), size))
+        return np.stack([half, -half], axis=1).reshape(-1, size)[:n]
 
     def _checked_draw(self, given):
         """The draws of `reset` (N, k), float64; BadInput where they are none."""

@@ -412,15 +412,16 @@ def test_seeds():
     assert (draws[0] != draws[2]).all() and len(np.unique(draws[0])) == draws[0].size
 
 
-@pytest.mark.parametrize("num_envs, group, groups", [(6, 2, 3), (7, 3, 3)])
+@pytest.mark.parametrize("num_envs, group, groups", [(6, 2, 3), (7, 3, 3), (8, 2, 4), (3, 3, 1)])
 def test_flights_of_a_group_share_their_draw(num_envs, group, groups):
-    """Flight k has draw k // G: the draws of a smaller batch, each G times; given draws stay each flight's own."""
-    batch, few = make(CUTOFF, num_envs), make(CUTOFF, groups)
+    """Flight k has draw k // G, every second one the mirror of the one before; given draws stay each flight's own."""
+    batch, half, few = make(CUTOFF, num_envs), make(CUTOFF, -(-groups // 2)), make(CUTOFF, groups)
     batch.flights_per_start = group
     rows = np.arange(num_envs) // group
     for seed in (1, None):  # the second draws anew
         batch.reset(seed=seed)
-        few.reset(seed=seed)
+        half.reset(seed=seed)  # a smaller batch without groups, whose draws have no mirror
+        few.reset(options={"draw": np.concatenate([[z, -z] for z in half.draw])[:groups]})
         np.testing.assert_array_equal(batch.draw, few.draw[rows])
         np.testing.assert_array_equal(batch.vehicles.mass, few.vehicles.mass[rows])
         assert len(np.unique(batch.draw[:, 0])) == groups
