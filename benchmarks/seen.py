@@ -1,0 +1,73 @@
+"""How far dispersed flights differ from their mean, and how much of what they miss could be told from that.
+
+    python benchmarks/seen.py results/rocket_dispersed/agent.safetensors
+
+Flies the mean action on 341 draws. Every 100 s, and 40 and 10 s before the first flight ends, it prints the standard
+deviation of each of the seven differences in the sizes of `DIFFERENCES`: a vehicle whose flights differ by far more or
+less wants other sizes. Beside it stands the part of the variance of each element's final miss that is a linear function
+of the differences (R squared): as the policy sees them, up to ten sizes, and as it would through tanh, which is flat
+beyond two and was in their place until commit 946da1f.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import torch
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from attention import load  # noqa: E402
+
+import envs  # noqa: E402
+import evaluate  # noqa: E402
+import ppo_gtrxl_rocket as script  # noqa: E402
+
+FLIGHTS = 341
+NAMES = ("altitude", "climb", "out of plane", "its speed", "speed", "log mass", "angle")
+
+
+def fly(agent, args, options, n):
+    """n dispersed flights of the mean action: observed (T, n, obs), steps flown (n,), final misses by element (n,)."""
+    mission, seen = envs.ROCKETS[args.env_id], []
+    policy = agent.make_policy(envs.gym.make_vec(args.env_id, num_envs=1, **options).episode_steps)
+
+    def recorded(obs, t):
+        seen.append(obs.copy())
+        return policy(obs, t)
+
+    z = evaluate.draws(mission.rocket, args.dispersion, args.eval_seed, n)
+    ends = evaluate.fly_dispersed(args.env_id, recorded, z, **options)
+    flown = np.ceil(ends["final_t"] / mission.rocket.dt - 1e-9).astype(int)
+    return torch.tensor(np.stack(seen), dtype=torch.float32), flown, evaluate.element_misses(ends, mission.rocket)
+
+
+def explained(inputs, y):
+    """R squared of the linear fit of y (n,) by inputs (n, k) and a constant."""
+    columns = np.column_stack([np.ones(len(y)), inputs])
+    left = y - columns @ np.linalg.lstsq(columns, y, rcond=None)[0]
+    return 1 - left.var() / y.var()
+
+
+def main():
+    agent, args, options = load(sys.argv[1])
+    if not args.dispersion:
+        sys.exit(f"{sys.argv[1]}: trained without --dispersion, it compares its flight with no others")
+    obs, flown, misses = fly(agent, args, options, FLIGHTS)
+    misses = {key.rsplit("_", 1)[0]: miss for key, miss in misses.items() if key != "apogee_km"}
+    dt, last = envs.ROCKETS[args.env_id].rocket.dt, int(flown.min())
+    late = [last - round(seconds / dt) for seconds in (40, 10)]
+    print("standard deviations of the differences, in their sizes:", ", ".join(NAMES))
+    print("and R squared of the final misses, by the differences / by their tanh:", ", ".join(misses))
+    for t in [*range(50, late[0], round(100 / dt)), *late]:
+        _, _, compared = script.motion(agent, obs[t])
+        differences = ((compared - agent.mean_flight[t]) / agent.differences).numpy().clip(-10, 10)
+        spread = " ".join(f"{size:5.2f}" for size in differences.std(axis=0))
+        flat = np.tanh(differences)
+        shares = (f"{explained(differences, y):5.2f} /{explained(flat, y):5.2f}" for y in misses.values())
+        print(f"{dt * t:5.0f} s   {spread}   " + "   ".join(shares))
+
+
+if __name__ == "__main__":
+    main()
