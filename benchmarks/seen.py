@@ -11,6 +11,7 @@ beyond two and was in their place until commit 946da1f.
 
 from __future__ import annotations
 
+import importlib
 import sys
 from pathlib import Path
 
@@ -22,8 +23,8 @@ from attention import load  # noqa: E402
 
 import envs  # noqa: E402
 import evaluate  # noqa: E402
-import ppo_gtrxl_rocket as script  # noqa: E402
 
+SCRIPT = importlib.import_module("ppo_gtrxl_rocket")
 FLIGHTS = 341
 NAMES = ("altitude", "climb", "out of plane", "its speed", "speed", "log mass", "angle")
 
@@ -61,7 +62,7 @@ def main():
     print("standard deviations of the differences, in their sizes:", ", ".join(NAMES))
     print("and R squared of the final misses, by the differences / by their tanh:", ", ".join(misses))
     for t in [*range(50, late[0], round(100 / dt)), *late]:
-        _, _, compared = script.motion(agent, obs[t])
+        _, _, compared = SCRIPT.motion(agent, obs[t])
         differences = ((compared - agent.mean_flight[t]) / agent.differences).numpy().clip(-10, 10)
         spread = " ".join(f"{size:5.2f}" for size in differences.std(axis=0))
         flat = np.tanh(differences)
