@@ -118,8 +118,8 @@ def features(agent, obs):
     """What the encoder sees of observations (..., 9 or more): the state in the target orbit's axes, and its error.
 
     h = r x v, e = v x h - r / |r| (mu = 1), error = [(h - h_T) / |h_T|, e - e_T], also as tanh(10 error): small ones
-    are seen. So is the little that this flight differs by from the mean of all at this step: linear, for at the cut-off
-    it is several times its size at first, and the perigee is in sums of it. All but the state is ours.
+    are seen. So is what this flight differs by from the mean of all at this step, linear up to ten of its sizes: where
+    the perigee will be is a sum of such differences, which tanh would flatten. All but the state is ours.
     """
     r, v, compared = motion(agent, obs)
     t_norm, phase = obs[..., 7:8], obs[..., 8:9]  # phase: 0 to 1, one of agent.phases (the paper's 0 to 3)

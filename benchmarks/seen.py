@@ -11,6 +11,7 @@ beyond two and was in their place until commit 946da1f.
 
 from __future__ import annotations
 
+import argparse
 import importlib
 import sys
 from pathlib import Path
@@ -52,9 +53,15 @@ def explained(inputs, y):
 
 
 def main():
-    agent, args, options = load(sys.argv[1])
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("checkpoint", help="agent.safetensors of a rocket trained with --dispersion")
+    path = parser.parse_args().checkpoint
+    try:
+        agent, args, options = load(path)
+    except envs.BadInput as error:
+        sys.exit(str(error))
     if not args.dispersion:
-        sys.exit(f"{sys.argv[1]}: trained without --dispersion, it compares its flight with no others")
+        sys.exit(f"checkpoint {path}: its dispersion is 0; it must be of a rocket trained with --dispersion")
     obs, flown, misses = fly(agent, args, options, FLIGHTS)
     misses = {key.rsplit("_", 1)[0]: miss for key, miss in misses.items() if key != "apogee_km"}
     dt, last = envs.ROCKETS[args.env_id].rocket.dt, int(flown.min())

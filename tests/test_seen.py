@@ -1,0 +1,49 @@
+"""`benchmarks/seen.py`: shares of variance by closed forms, the shipped policy's table, and what it refuses."""
+
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import seen
+
+RESULTS = Path(__file__).parent.parent / "results"
+
+
+def test_explained_is_the_square_of_the_correlation():
+    """Of one input; of several that the target is the sum of, one; of what has nothing to do with it, next to none."""
+    x, noise = np.random.default_rng(0).standard_normal((2, 1000))
+    assert seen.explained(x[:, None], x + noise) == pytest.approx(np.corrcoef(x, x + noise)[0, 1] ** 2)
+    assert seen.explained(np.stack([x, noise], 1), 3 * x - noise + 5) == pytest.approx(1)
+    assert seen.explained(noise[:, None], x) < 0.01
+
+
+def run(monkeypatch, path, flights=seen.FLIGHTS):
+    monkeypatch.setattr(sys, "argv", ["seen.py", str(path)])
+    monkeypatch.setattr(seen, "FLIGHTS", flights)
+    seen.main()
+
+
+def test_the_shipped_policy(monkeypatch, capsys):
+    """Early the angle differs by less than its size, at the end by several; the perigee is then seen, less by tanh."""
+    run(monkeypatch, RESULTS / "rocket_dispersed/agent.safetensors", flights=40)
+    _, _, *lines = capsys.readouterr().out.splitlines()
+    rows = np.array([re.findall(r"[\d.]+", line) for line in lines], dtype=float)
+    assert rows.shape == (10, 1 + 7 + 2 * 4) and rows[0, 0] == 100 and (np.diff(rows[:, 0]) > 0).all()
+    assert rows[0, 7] < 1 and 3 < rows[-1, 7] < 6
+    by_differences, by_tanh = rows[:, 8::2], rows[:, 9::2]
+    assert (by_differences <= 1).all() and by_differences[-1, 0] > 0.99 > by_tanh[-1, 0]
+
+
+@pytest.mark.parametrize("path", [RESULTS / "di/agent.safetensors", RESULTS / "rocket_cutoff/agent.safetensors"])
+def test_policies_that_compare_with_no_others_are_refused(monkeypatch, path):
+    with pytest.raises(
+        SystemExit, match=f"checkpoint {path}: its dispersion is 0; it must be of a rocket trained with"
+    ):
+        run(monkeypatch, path)
+
+
+def test_a_checkpoint_that_is_not_there_is_refused(monkeypatch, tmp_path):
+    with pytest.raises(SystemExit, match="nothing: No such file or directory; it must be an agent.safetensors"):
+        run(monkeypatch, tmp_path / "nothing")
