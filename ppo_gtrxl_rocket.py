@@ -47,16 +47,16 @@ class Args:
     eval_seed: int = 0  # seed of the evaluation starts
     eval_json: str | None = None  # where --eval-only writes the metrics
     eval_npz: str | None = None  # where --eval-only writes the trajectories
-    eval_every: int = 5  # evaluate every so many updates, on starts of its own (0: only at the end)
+    eval_every: int = 5  # evaluate every so many updates, with --dispersion on its own draws (0: only at the end)
 
     # environment
     env_id: str = "RocketAscent-v0"  # the id of the environment, one of ENV_IDS
     observe_phase: bool = True  # show time and phase to the policy
-    dispersion: float = 0.0  # every flight draws its own vehicle and air: 0 none, 1 the table `envs.Dispersion`
+    dispersion: float = 0.0  # size of the draws of vehicle and air: 0 none, 1 the table `envs.Dispersion`
     observe_draw: bool = False  # show the draw to the policy: an oracle
     observe_mass: bool = False  # show the true mass of a dispersed rocket, not the flight computer's
     action_frame: str = "local"  # the thrust direction's axes: local (up, along-track, cross-track) or eci
-    guidance: str = "none"  # in training: early reference pitch of R_guidance: none (R_guidance is 0), linear or knots
+    guidance: str = "none"  # in training: R_guidance's early reference pitch: none (0, as R_trajectory), linear, knots
     mass_weight: float = 2.0  # cut-off: factor on `mass_rewards` (paid where 8 or more flights have the same start)
     reward_scale: float = 0.2  # factor on the rewards in training; everything logged is unscaled
 
@@ -101,7 +101,7 @@ class Args:
 ENV_IDS = tuple(ROCKETS)
 ENV_OPTIONS = ("observe_phase", "action_frame", "dispersion", "observe_draw", "observe_mass")  # of the environments
 BUFFERS = {env_id: policy_constants(mission.rocket) for env_id, mission in ROCKETS.items()}  # read as agent.<name>
-INITIAL_ACTION = [1.0, 0.0, 0.0]  # straight up: a randomly steered rocket never leaves the ground
+INITIAL_ACTION = [1.0, 0.0, 0.0]  # straight up (local frame): a randomly steered rocket never leaves the ground
 
 
 def motion(agent, obs):
@@ -109,7 +109,7 @@ def motion(agent, obs):
     r, v, mass = (obs[..., :7] / agent.units).split([3, 3, 1], dim=-1)
     r, v = r @ agent.axes.T, v @ agent.axes.T  # towards the perigee, along the semi-latus rectum, normal to the plane
     radius, speed = r.norm(dim=-1, keepdim=True), v.norm(dim=-1, keepdim=True)
-    altitude, climb = 64 * (radius - 1), 8 * (r * v).sum(dim=-1, keepdim=True) / radius  # in 100 km and km/s
+    altitude, climb = 64 * (radius - 1), 8 * (r * v).sum(dim=-1, keepdim=True) / radius  # in some 100 km and 1 km/s
     angle = torch.atan2(r[..., 1:2], r[..., :1])
     return r, v, torch.cat([altitude, climb, 64 * r[..., 2:], 8 * v[..., 2:], speed, mass.log(), angle], dim=-1)
 
@@ -117,9 +117,9 @@ def motion(agent, obs):
 def features(agent, obs):
     """What the encoder sees of observations (..., 9 or more): the state in the target orbit's axes, and its error.
 
-    h = r x v, e = v x h - r / |r| (mu = 1), error = [(h - h_T) / |h_T|, e - e_T], also as tanh(10 error): small ones
-    are seen. So is what this flight differs by from the mean of all at this step, linear up to ten of its sizes: where
-    the perigee will be is a sum of such differences, which tanh would flatten. All but the state is ours.
+    h = r x v, e = v x h - r / |r| (mu = 1), error = [(h - h_T) / |h_T|, e - e_T], and tanh(10 error), which shows small
+    errors. Then the difference from the mean flight at this step, in units of `differences`, clipped at 10: where the
+    perigee will be is a sum of such differences, which tanh would flatten. Error and difference are ours.
     """
     r, v, compared = motion(agent, obs)
     t_norm, phase = obs[..., 7:8], obs[..., 8:9]  # phase: 0 to 1, one of agent.phases (the paper's 0 to 3)
@@ -130,8 +130,8 @@ def features(agent, obs):
     step = ((1 - t_norm[..., 0]) * agent.steps).round().long().clamp(max=len(agent.mean_flight) - 1)
     mean = agent.mean_flight[step]  # zeros until there has been a flight to compare with
     differs = mean.any(dim=-1, keepdim=True) * ((compared - mean) / agent.differences).clamp(-10, 10)
-    state = [r, v, compared[..., :5], t_norm, compared[..., 5:6], one_hot, error, (10 * error).tanh()]
-    return torch.cat([*state, obs[..., 9:], differs], dim=-1)  # behind the nine: the draw, with --observe-draw
+    seen = [r, v, compared[..., :5], t_norm, compared[..., 5:6], one_hot, error, (10 * error).tanh()]
+    return torch.cat([*seen, obs[..., 9:], differs], dim=-1)  # behind the nine: the draw, with --observe-draw
 
 
 @torch.no_grad()
@@ -146,9 +146,9 @@ def learn_buffers(agent, averaged, args, batch):
     rows = agent.mean_flight[: len(batch.obs)]  # a view
     alive = batch.alive[: len(rows)]
     mean, _ = moments(motion(agent, batch.obs[: len(rows)])[2], alive[..., None], 1)
-    share = total(alive.sum(1)) / total(torch.ones_like(alive).sum(1))
-    rate = torch.where(rows.any(dim=1), 0.1, 1.0) * (share >= 0.25)  # few flights say little
-    rows += rate[:, None] * (mean[:, 0] - rows)
+    share, _ = moments(alive, torch.ones_like(alive), 1)
+    rate = torch.where(rows.any(dim=1, keepdim=True), 0.1, 1.0) * (share >= 0.25)  # few flights say little
+    rows += rate * (mean[:, 0] - rows)
 
 
 def mean_action(output, action_scale):
@@ -157,7 +157,7 @@ def mean_action(output, action_scale):
 
 
 def shape_rewards(envs, args, progress, batch, episodes):
-    """With cut-off, pay a flight's last step its `mass_rewards`, all of them from 20 to 50 % of the updates; ours."""
+    """With cut-off, pay a flight's last step its `mass_rewards`, in full from 20 to 50 % of the updates; ours."""
     weight = envs.cutoff * args.mass_weight * np.interp(progress, [0.1, 0.2, 0.5, 0.85], [0.0, 1.0, 1.0, 0.0])
     if weight:
         group_size = args.flights_per_start if args.dispersion else len(episodes["error"])
@@ -170,8 +170,8 @@ def shape_rewards(envs, args, progress, batch, episodes):
 def set_curriculum(envs, args, progress, refines, std):
     """What only training changes, all of it ours; returns how many flights in a row have the same start, or draw.
 
-    Noise std scatters the ends of the flights by about std / 10: R_terminal need not be steeper. On dispersed flights
-    it stays at 0.001: a smaller scale was no better.
+    R_terminal's scale follows the noise, which scatters the ends of the flights by about std / 10: std / 8, at most
+    TERMINAL_SCALE, on dispersed flights at least 0.001 (smaller was no better).
     """
     envs.guidance = args.guidance
     envs.terminal_scale = min(TERMINAL_SCALE, max(std / 8, 0.001 if args.dispersion else 0.0))
@@ -353,7 +353,7 @@ class Agent(nn.Module):
         return probs.log_prob(actions).sum(-1), probs.entropy().sum(-1), self.critic(hidden).squeeze(-1)
 
     def make_policy(self, steps):
-        """What evaluation flies: the mean action, with no noise in the memory, of (obs (N, obs), t) in NumPy."""
+        """What evaluation flies: obs (N, obs), t -> mean actions (N, actions), in NumPy; its memory begins as zeros."""
         like, cache = self.actor_logstd, []
 
         @torch.no_grad()
@@ -378,8 +378,8 @@ class Batch:
     values: torch.Tensor  # (T, N), the critic's output
     alive: torch.Tensor  # (T, N)
     memory: torch.Tensor  # (blocks, N, L, d), m_0; what follows, encode makes anew from obs, with gradients
-    advantages: torch.Tensor | None = None  # (T, N), filled by train, as the returns
-    returns: torch.Tensor | None = None  # (T, N), what the critic learns
+    advantages: torch.Tensor | None = None  # (T, N), set by train, as is the next
+    returns: torch.Tensor | None = None  # (T, N), what the critic learns: the returns less their baseline, in its unit
 
 
 @torch.no_grad()
@@ -432,9 +432,9 @@ def moments(x, alive, dim):
 def linear_fit(x, y, alive):
     """Ridge regression of y (..., G) on x (..., G, k) over the G episodes of a group that live: the fitted y.
 
-    Each episode is in its own fit. Its residual is 1 - l times that of a fit without it, with the leverage l a function
-    of the states at this step alone, not of the action: a state's gradient keeps its direction, extreme states count
-    less. (A fit without it was worse: docs/training-notes.md.)
+    Each episode is in its own fit. Its residual is 1 - l times that of a fit without it (scaled and ridged alike),
+    with the leverage l a function of the states at this step alone, not of the action: a state's gradient keeps its
+    direction, extreme states count less. (A fit without it was worse: docs/training-notes.md.)
     """
     weight, count = alive.double()[..., None], alive.double().sum(-1)[..., None, None].clamp(min=1)
     x, y = x.double(), y.double()[..., None]
@@ -542,11 +542,10 @@ def train(args, agent, average, optimizer, envs, run):
         baseline, scale = returns_baseline(batch, args.gamma, group)
         values = baseline + scale * batch.values
         advantages, returns = gae(batch.rewards, values, batch.alive, args.gamma, gae_lambda)
-        batch.returns = (returns - baseline) / scale
+        batch.advantages, batch.returns = advantages, (returns - baseline) / scale
         if args.norm_adv:
             mean, variance = moments(advantages, batch.alive, (0, 1))
-            advantages = (advantages - mean) / (variance.sqrt() + 1e-8)
-        batch.advantages = advantages
+            batch.advantages = (advantages - mean) / (variance.sqrt() + 1e-8)
 
         log = []
         for epoch in range(1, args.update_epochs + 1):  # line 15
@@ -575,6 +574,7 @@ def train(args, agent, average, optimizer, envs, run):
         if args.noise == "schedule" or refines:
             updates_left = max(args.total_updates - iteration, 1)
             agent.actor_logstd.data += (args.log_std_final - agent.actor_logstd.data) / updates_left
+        agent.actor_logstd.data.clamp_(*LOG_STD_RANGE)  # learned beyond it, it would have no gradient to come back by
         run.end_update(iteration, batch.alive, episodes, means, learning_rate)
 
 

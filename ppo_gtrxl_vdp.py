@@ -307,7 +307,7 @@ class Agent(nn.Module):
         return probs.log_prob(actions).sum(-1), probs.entropy().sum(-1), self.critic(hidden).squeeze(-1)
 
     def make_policy(self, steps):
-        """What evaluation flies: the mean action, with no noise in the memory, of (obs (N, obs), t) in NumPy."""
+        """What evaluation flies: obs (N, obs), t -> mean actions (N, actions), in NumPy; its memory begins as zeros."""
         like, cache = self.actor_logstd, []
 
         @torch.no_grad()
@@ -332,8 +332,8 @@ class Batch:
     values: torch.Tensor  # (T, N), the critic's output
     alive: torch.Tensor  # (T, N)
     memory: torch.Tensor  # (blocks, N, L, d), m_0; what follows, encode makes anew from obs, with gradients
-    advantages: torch.Tensor | None = None  # (T, N), filled by train, as the returns
-    returns: torch.Tensor | None = None  # (T, N), what the critic learns
+    advantages: torch.Tensor | None = None  # (T, N), set by train, as is the next
+    returns: torch.Tensor | None = None  # (T, N), what the critic learns: the returns less their baseline, in its unit
 
 
 @torch.no_grad()
@@ -386,9 +386,9 @@ def moments(x, alive, dim):
 def linear_fit(x, y, alive):
     """Ridge regression of y (..., G) on x (..., G, k) over the G episodes of a group that live: the fitted y.
 
-    Each episode is in its own fit. Its residual is 1 - l times that of a fit without it, with the leverage l a function
-    of the states at this step alone, not of the action: a state's gradient keeps its direction, extreme states count
-    less. (A fit without it was worse: docs/training-notes.md.)
+    Each episode is in its own fit. Its residual is 1 - l times that of a fit without it (scaled and ridged alike),
+    with the leverage l a function of the states at this step alone, not of the action: a state's gradient keeps its
+    direction, extreme states count less. (A fit without it was worse: docs/training-notes.md.)
     """
     weight, count = alive.double()[..., None], alive.double().sum(-1)[..., None, None].clamp(min=1)
     x, y = x.double(), y.double()[..., None]
@@ -496,11 +496,10 @@ def train(args, agent, average, optimizer, envs, run):
         baseline, scale = returns_baseline(batch, args.gamma, group)
         values = baseline + scale * batch.values
         advantages, returns = gae(batch.rewards, values, batch.alive, args.gamma, gae_lambda)
-        batch.returns = (returns - baseline) / scale
+        batch.advantages, batch.returns = advantages, (returns - baseline) / scale
         if args.norm_adv:
             mean, variance = moments(advantages, batch.alive, (0, 1))
-            advantages = (advantages - mean) / (variance.sqrt() + 1e-8)
-        batch.advantages = advantages
+            batch.advantages = (advantages - mean) / (variance.sqrt() + 1e-8)
 
         log = []
         for epoch in range(1, args.update_epochs + 1):  # line 15
@@ -529,6 +528,7 @@ def train(args, agent, average, optimizer, envs, run):
         if args.noise == "schedule" or refines:
             updates_left = max(args.total_updates - iteration, 1)
             agent.actor_logstd.data += (args.log_std_final - agent.actor_logstd.data) / updates_left
+        agent.actor_logstd.data.clamp_(*LOG_STD_RANGE)  # learned beyond it, it would have no gradient to come back by
         run.end_update(iteration, batch.alive, episodes, means, learning_rate)
 
 

@@ -61,17 +61,19 @@ class RocketVectorEnv(BatchedEnv):
     at the step's start, then held in ECI. A step is one RK4 step between events: staging, a stage that runs dry
     (`table_isp`), the end of the episode.
 
-    With `dispersion` k > 0 no flight is like another: each episode draws standard scores, clipped at +-3 (see
-    `draw_bounds`), in the order of `draw_names`, and flies the vehicle of `draw_vehicles`, k times `DISPERSION` from
+    With `dispersion` D > 0 each group of `flights_per_start` episodes draws its k standard scores, clipped at +-3 (see
+    `draw_bounds`), in the order of `draw_names`, and flies the vehicle of `draw_vehicles`, D times `DISPERSION` from
     the nominal one. `reset(options={"draw": z})`, z (N, k), gives them, also beyond 3; BadInput refuses what no vehicle
     can be. Events and phases are then each flight's own. The mass that is observed is the flight computer's: the
     nominal schedule from the last staging on; `observe_mass` shows the true one. `observe_draw` puts the scores behind
     the nine.
 
     With a `cutoff` mission (ours: the paper fixes the final time) the engine stops when, in the last phase, the energy
-    reaches the target's: the root within the step, to 1e-10, ends the episode. An altitude below 0 ends it too (crash),
-    and so does `end_time`; with dispersion the burn-out of a flight's own last stage does in its place, and t_norm may
-    end below 0 (unless `end_time` is another than the rocket's, or that one before the last burn's end).
+    reaches the target's: the root within the step, to 1e-10, ends the episode.
+
+    Every flight also ends below altitude 0 (a crash), and at `end_time`. With cut-off and dispersion the burn-out of
+    its own last stage takes the place of `end_time` (t_norm may end below 0), as long as that is the rocket's and the
+    last burn's end.
 
     Reward: the sum of the five parts R_orbital, R_trajectory, R_guidance, R_penalties and R_terminal, each a function
     of `rocket.py`. `final_info`, (N,) each: `error_norm` (and `error` (N, 6), the terminal error in ECI), `a_km e i_deg

@@ -133,21 +133,22 @@ def test_a_cell_says_of_how_many_seeds_it_is():
 
 
 def test_a_line_for_each_run(tmp_path, monkeypatch, capsys):
-    """Those of the nominal flight lie in a folder for each seed."""
+    """Those of L_mem 32 lie in a results folder of their own, beside results/memory."""
+    folder, seeds = tmp_path / "memory", tmp_path / "rocket_cutoff" / "seeds"
+    (folder / "nominal").mkdir(parents=True)
+    seeds.mkdir(parents=True)
     for seed, error in {1: 0.25, 2: 0.5}.items():
-        seeds = tmp_path / "nominal" / f"seed_{seed}" / "mlp" / "seeds"
-        seeds.mkdir(parents=True)
         metrics = {"env_id": "RocketAscentCutoff-v0", "seed": seed, "error_norm": error, "final_mass_kg": 7500.0}
         (seeds / f"{seed}.json").write_text(json.dumps(metrics))
-    monkeypatch.setattr(sys, "argv", ["memory.py", str(tmp_path), "--by-seed"])
+    monkeypatch.setattr(sys, "argv", ["memory.py", str(folder), "--by-seed"])
     memory.main()
     title, header, first, second = (re.split("  +", line.strip()) for line in capsys.readouterr().out.splitlines())
     assert "nominal flight" in title[0] and header == ["seed", "||error||", "perigee (km)", "mass (kg)"]
-    assert first[1:] == ["1", "0.25", "-", "7500"] and second[1:] == ["2", "0.5", "-", "7500"]
-    monkeypatch.setattr(sys, "argv", ["memory.py", str(tmp_path)])
+    assert first == ["L_mem 32", "1", "0.25", "-", "7500"] and second == ["L_mem 32", "2", "0.5", "-", "7500"]
+    monkeypatch.setattr(sys, "argv", ["memory.py", str(folder)])
     memory.main()
     assert "0.375 (0.25 to 0.5)" in capsys.readouterr().out
-    assert not list(tmp_path.glob("*.png"))  # these rows are a means, not a finding
+    assert not list(tmp_path.rglob("*.png"))  # these rows are a means, not a finding
 
 
 def test_the_figure_is_whole_or_as_it_was(tmp_path, monkeypatch, capsys, cut_figures):
@@ -201,40 +202,58 @@ def test_an_empty_folder_is_one_line(tmp_path, monkeypatch):
         memory.main()
 
 
-def nominal_flags():
-    """By the start of a run with a policy of memory_nominal_jobs.txt, of the same seed: what that policy decides."""
-    found = {}
-    for line in (ROOT / "benchmarks" / "memory_nominal_jobs.txt").read_text().splitlines():
-        if not line.startswith("#"):
-            folder, flags = line.split("  ppo_gtrxl_rocket.py ")
-            flags = flags.replace("--total-updates 300 ", "").replace(" --num-threads 1", "")
-            seed, decided = re.fullmatch(r"--seed (\d) (.*)", flags).groups()
-            found[f"--seed {seed} --checkpoint {folder}/agent.safetensors"] = f"--seed {seed} {decided}"
-    return found
-
-
-def test_every_row_of_the_tables_has_its_three_jobs(tmp_path):
+def test_every_row_of_the_tables_has_its_three_jobs():
     """Seeds 1 to 3 of each, by one command that differs from its neighbours by what the row says alone."""
-    lists = ("memory_di_jobs.txt", "memory_rocket_jobs.txt")
-    text, nominal = "\n".join((ROOT / "benchmarks" / name).read_text() for name in lists), nominal_flags()
-    assert len(nominal) == 3 * len(memory.EXPERIMENTS["rocket"].rows)
-    for start, flags in nominal.items():
-        assert text.count(start) == 1
-        text = text.replace(start, flags)
-    (tmp_path / "jobs.txt").write_text(text)
-    jobs = run_seeds.read_jobs(tmp_path / "jobs.txt")
-    found = []
-    experiments = {name: experiment for name, experiment in memory.EXPERIMENTS.items() if name != "nominal"}
-    for name, experiment in experiments.items():
-        for row in experiment.rows:
+    jobs, found = run_seeds.read_jobs(ROOT / "benchmarks" / "memory_di_jobs.txt"), []
+    hidden = {"hidden_phase": "observe_phase", "hidden_velocity": "observe_velocity"}
+    for name, observed in hidden.items():
+        for row in memory.EXPERIMENTS[name].rows:
             mine = [job for job in jobs if job.results == Path(f"results/memory/{name}/{row}")]
             assert sorted(job.args["seed"] for job in mine)[:3] == [1, 2, 3], (name, row)
-            found += [(name, row, job) for job in mine]
-    assert len(found) == len(jobs) == 3 * 19 + 2  # the velocity is shown to five seeds of L_mem 32
-    hidden = {"rocket": None, "hidden_phase": "observe_phase", "hidden_velocity": "observe_velocity"}
-    for name, row, job in found:
-        if length := re.search(r"memory_(\d+)", row):
-            assert job.args["memory_length"] == int(length[1])
-        if hidden[name]:
-            assert job.args[hidden[name]] == row.startswith("shown"), shlex.join(job.command)
-    assert all(job.args["num_blocks"] == 0 for job in jobs if job.results.name == "mlp")
+            for job in mine:
+                assert job.args[observed] == row.startswith("shown"), shlex.join(job.command)
+                if length := re.search(r"memory_(\d+)", row):
+                    assert job.args["memory_length"] == int(length[1])
+            found += mine
+    assert len(found) == len(jobs) == 3 * 12 + 2  # the velocity is shown to five seeds of L_mem 32
+
+
+CHANGED = {
+    "memory_0": {"memory_length": 0},
+    "memory_8": {"memory_length": 8},
+    "memory_128": {"memory_length": 128},
+    "mlp": {"num_blocks": 0, "embed_dim": 192, "hidden_dim": 192},
+    "true_mass": {"observe_mass": True},
+    "oracle": {"observe_draw": True},
+}
+
+
+def rocket_jobs(tmp_path, name, begun=()):
+    """The jobs of a list in benchmarks/, policies that are not shipped replaced by the flags that they began with."""
+    text = (ROOT / "benchmarks" / name).read_text()
+    for row in begun:
+        flags = " ".join(
+            f"--{key.replace('_', '-')} {'' if value is True else value}" for key, value in CHANGED[row].items()
+        )
+        path = f"--checkpoint results/memory/nominal/{row}/agent.safetensors"
+        assert text.count(path) == 3
+        text = text.replace(path, f"--env-id RocketAscentCutoff-v0 {flags}")
+    (tmp_path / name).write_text(text)
+    return run_seeds.read_jobs(tmp_path / name)
+
+
+def test_the_rockets_rows_are_the_shipped_commands_but_for_what_they_say(tmp_path, monkeypatch):
+    """L_mem 32 is the front page's result, so each other row has to be its command with one thing changed."""
+    monkeypatch.chdir(ROOT)  # the shipped commands name the shipped policy
+    shipped = {(job.results.name, job.args["seed"]): job.args for job in rocket_jobs(tmp_path, "result_jobs.txt")}
+    nominal = rocket_jobs(tmp_path, "memory_nominal_jobs.txt")
+    dispersed = rocket_jobs(tmp_path, "memory_rocket_jobs.txt", begun=CHANGED)
+    assert [job.args["seed"] for job in nominal] == [1] * 6
+    assert sorted(job.args["seed"] for job in dispersed) == [1] * 6 + [2] * 6 + [3] * 6
+    for result, experiment, jobs in (("rocket_cutoff", "nominal", nominal), ("rocket_dispersed", "rocket", dispersed)):
+        rows = set(memory.EXPERIMENTS[experiment].rows)
+        assert rows == {f"../../{result}", *CHANGED} and {job.results.name for job in jobs} == set(CHANGED)
+        for job in jobs:
+            theirs = shipped[result, job.args["seed"]]
+            different = {key: value for key, value in job.args.items() if value != theirs[key] and key != "checkpoint"}
+            assert different == CHANGED[job.results.name], shlex.join(job.command)

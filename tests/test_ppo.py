@@ -217,6 +217,11 @@ def test_noise_falls_from_wherever_it_is(learner):
         assert log_stds(run, 3) == pytest.approx([(first - 2.0) / 2, -2.0, -2.0])
 
 
+def test_learned_noise_stays_where_it_can_be_learned(learner):
+    """An entropy bonus pushes it up; beyond its bounds it would have no gradient, and never come back."""
+    assert log_stds(learner(noise="learned", log_std=0.5, ent_coef=1.0, ent_coef_final=1.0), 3) == [0.5] * 3
+
+
 def test_noise_reaches_minus_eight(learner):
     """The policy samples with what the schedule ends at: a standard deviation of 3e-4."""
     run = learner(noise="schedule", log_std_final=-8.0, total_updates=2)
