@@ -78,6 +78,13 @@ def rocket_rows(result):
     }
 
 
+DISPERSED = {
+    "dispersed_error_median": "median",
+    "dispersed_error_p95": "p95",
+    "dispersed_perigee_error_std_km": "perigee, sigma (km)",
+    "dispersed_box_rate": "in the box",
+    "dispersed_mass_mean_kg": "mass (kg)",
+}
 EXPERIMENTS = {
     "hidden_velocity": Experiment(
         "Double integrator, velocity hidden: cost over the optimum's, which sees it (ratio of sums)",
@@ -113,14 +120,14 @@ EXPERIMENTS = {
     "rocket": Experiment(
         "Dispersed rocket, cut-off: ||error|| over 1705 flights",
         rocket_rows("rocket_dispersed"),
-        {
-            "dispersed_error_median": "median",
-            "dispersed_error_p95": "p95",
-            "dispersed_perigee_error_std_km": "perigee, sigma (km)",
-            "dispersed_box_rate": "in the box",
-            "dispersed_mass_mean_kg": "mass (kg)",
-        },
+        DISPERSED,
         log=True,
+    ),
+    "rocket_before": Experiment(
+        "The same by 431bf3e to f6892e8, which saw less of what a flight differs by",
+        {**lengths(8, 32, 128), "true_mass": "L_mem 32, true mass seen"},
+        DISPERSED,
+        drawn=False,
     ),
 }
 
