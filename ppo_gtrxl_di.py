@@ -84,12 +84,12 @@ class Args:
     target_kl: float | None = None  # the KL divergence from which an update takes no further step (none: no limit)
     lr_schedule: str = "linear"  # linear, or std: --learning-rate times the policy's standard deviation
     noise: str = "learned"  # who sets the log-std: learned (the optimiser) or schedule (linear)
-    log_std: float = 0.0  # initial log of the policy's standard deviation, in the action's unit, -8 to 0.5
+    log_std: float = 0.0  # initial log of the policy's std in the action's unit, -8 to 0.5 (else a --checkpoint's)
     log_std_final: float = -4.0  # log-std of the last update, where it is not learned to the end
     flights_per_start: int = 1  # flights of each start in the refinement, compared with one another (1: the paper)
     refine_from: float | None = None  # part of the updates after which the refinement begins (none: never)
     log_std_refine: float | None = None  # log-std at the refinement's beginning (none: as it is)
-    weight_average: float = 0.998  # decay of the averaged weights used in evaluation (0: off)
+    weight_average: float = 0.998  # decay, per optimiser step, of the averaged weights used in evaluation (0: off)
 
 
 # Problem: what differs from the other scripts -------------------------------------------------------------------------
@@ -333,7 +333,7 @@ class Batch:
     alive: torch.Tensor  # (T, N)
     memory: torch.Tensor  # (blocks, N, L, d), m_0; what follows, encode makes anew from obs, with gradients
     advantages: torch.Tensor | None = None  # (T, N), set by train, as is the next
-    returns: torch.Tensor | None = None  # (T, N), what the critic learns: the returns less their baseline, in its unit
+    returns: torch.Tensor | None = None  # (T, N), what the critic learns: (returns - b) / c of `returns_baseline`
 
 
 @torch.no_grad()
@@ -413,7 +413,7 @@ def returns_baseline(batch, gamma, group):
     obs, returns, alive = (x.unflatten(1, (-1, group)) for x in (batch.obs, returns, batch.alive))
     baseline = linear_fit(obs, returns, alive).flatten(1)
     _, variance = moments(returns.flatten(1) - baseline, batch.alive, 1)
-    floor = 0.3 * variance.sqrt().mean()  # some steps have next to no spread
+    floor = 0.3 * variance.sqrt().mean()  # some steps have next to no spread (those after every end count, as 0)
     return baseline, (variance + floor**2 + 1e-8).sqrt()
 
 
@@ -456,7 +456,7 @@ def linear_schedule(first, last, progress):
 
 
 def begin_refinement(agent, args):
-    """From here on the noise is set, not learned; where starts are now flown in groups, V starts as their baseline."""
+    """From here on the noise is set, not learned; where starts are flown in groups, V begins anew as their baseline."""
     if args.log_std_refine is not None:
         nn.init.constant_(agent.actor_logstd, args.log_std_refine)
     if args.flights_per_start > 1:

@@ -1,7 +1,7 @@
 """PPO with a Gated Transformer-XL on a four-phase rocket ascent, measured against the true optimum in the same run.
 
-    python ppo_gtrxl_rocket.py --seed 1  # fixed 961 s, as in the paper; results/rocket_fixed/README.md has its flags
-    python ppo_gtrxl_rocket.py --seed 1 --env-id RocketAscentCutoff-v0  # free final time; README.md has its flags
+    python ppo_gtrxl_rocket.py --seed 1  # the paper's 961 s by the defaults; the result's flags: results/rocket_fixed
+    python ppo_gtrxl_rocket.py --seed 1 --env-id RocketAscentCutoff-v0  # free final time; its flags: README.md
     python ppo_gtrxl_rocket.py --eval-only --checkpoint results/rocket_fixed/agent.safetensors
 
 Top to bottom: arguments, problem, Gated Transformer-XL, agent, PPO, training, main. From the first
@@ -43,7 +43,7 @@ class Args:
     checkpoint: str | None = None  # start from these weights (.safetensors)
     resume: str | None = None  # run folder of an interrupted run to go on with, bit for bit
     eval_only: bool = False  # fly the mean action of --checkpoint, train nothing, write only --eval-json and --eval-npz
-    eval_starts: int | None = None  # number of evaluation flights with --dispersion (without it there is one)
+    eval_starts: int | None = None  # evaluation flights with --dispersion (none: 1705; on the nominal rocket one)
     eval_seed: int = 0  # seed of the evaluation starts
     eval_json: str | None = None  # where --eval-only writes the metrics
     eval_npz: str | None = None  # where --eval-only writes the trajectories
@@ -56,8 +56,8 @@ class Args:
     observe_draw: bool = False  # show the draw to the policy: an oracle
     observe_mass: bool = False  # show the true mass of a dispersed rocket, not the flight computer's
     action_frame: str = "local"  # the thrust direction's axes: local (up, along-track, cross-track) or eci
-    guidance: str = "none"  # in training: R_guidance's early reference pitch: none (0, as R_trajectory), linear, knots
-    mass_weight: float = 2.0  # cut-off: factor on `mass_rewards` (paid where 8 or more flights have the same start)
+    guidance: str = "none"  # in training, R_guidance's early reference pitch: none (no R_guidance), linear or knots
+    mass_weight: float = 2.0  # cut-off: factor on `mass_rewards`, which compares 8 or more flights of a start
     reward_scale: float = 0.2  # factor on the rewards in training; everything logged is unscaled
 
     # transformer (a laptop's; docs/decisions.md has Table 1's beside ours)
@@ -89,12 +89,12 @@ class Args:
     target_kl: float | None = 0.02  # the KL divergence from which an update takes no further step (none: no limit)
     lr_schedule: str = "std"  # linear, or std: --learning-rate times the policy's standard deviation
     noise: str = "schedule"  # who sets the log-std: learned (the optimiser) or schedule (linear)
-    log_std: float = -1.4  # initial log of the policy's standard deviation, in the action's unit, -8 to 0.5
+    log_std: float = -1.4  # initial log of the policy's std in the action's unit, -8 to 0.5 (else a --checkpoint's)
     log_std_final: float = -5.0  # log-std of the last update, where it is not learned to the end
-    flights_per_start: int = 32  # flights of each start or draw, compared with one another (1: the paper)
+    flights_per_start: int = 32  # flights of each start or draw, compared with one another: 16 or more (1: the paper)
     refine_from: float | None = None  # part of the updates after which the refinement begins (none: never)
     log_std_refine: float | None = None  # log-std at the refinement's beginning (none: as it is)
-    weight_average: float = 0.99  # decay of the averaged weights used in evaluation (0: off)
+    weight_average: float = 0.99  # decay, per optimiser step, of the averaged weights used in evaluation (0: off)
 
 
 # Problem: what differs from the other scripts -------------------------------------------------------------------------
@@ -115,7 +115,7 @@ def motion(agent, obs):
 
 
 def features(agent, obs):
-    """What the encoder sees of observations (..., 9 or more): the state in the target orbit's axes, and its error.
+    """What the encoder sees (..., inputs) of observations (..., 9 or more): state and error in the target orbit's axes.
 
     h = r x v, e = v x h - r / |r| (mu = 1), error = [(h - h_T) / |h_T|, e - e_T], and tanh(10 error), which shows small
     errors. Then the difference from the mean flight at this step, in units of `differences`, clipped at 10: where the
@@ -143,7 +143,7 @@ def learn_buffers(agent, averaged, args, batch):
             network.encoder[0].weight[:, -new_inputs:] = 0.0
     if not args.dispersion:
         return
-    rows = agent.mean_flight[: len(batch.obs)]  # a view
+    rows = agent.mean_flight[: len(batch.obs)]  # a view; `averaged` copies it at its next step
     alive = batch.alive[: len(rows)]
     mean, _ = moments(motion(agent, batch.obs[: len(rows)])[2], alive[..., None], 1)
     share, _ = moments(alive, torch.ones_like(alive), 1)
@@ -157,7 +157,7 @@ def mean_action(output, action_scale):
 
 
 def shape_rewards(envs, args, progress, batch, episodes):
-    """With cut-off, pay a flight's last step its `mass_rewards`, in full from 20 to 50 % of the updates; ours."""
+    """With cut-off, pay a flight's last step its `mass_rewards`, from 10 to 85 % of the updates. Ours."""
     weight = envs.cutoff * args.mass_weight * np.interp(progress, [0.1, 0.2, 0.5, 0.85], [0.0, 1.0, 1.0, 0.0])
     if weight:
         group_size = args.flights_per_start if args.dispersion else len(episodes["error"])
@@ -379,7 +379,7 @@ class Batch:
     alive: torch.Tensor  # (T, N)
     memory: torch.Tensor  # (blocks, N, L, d), m_0; what follows, encode makes anew from obs, with gradients
     advantages: torch.Tensor | None = None  # (T, N), set by train, as is the next
-    returns: torch.Tensor | None = None  # (T, N), what the critic learns: the returns less their baseline, in its unit
+    returns: torch.Tensor | None = None  # (T, N), what the critic learns: (returns - b) / c of `returns_baseline`
 
 
 @torch.no_grad()
@@ -459,7 +459,7 @@ def returns_baseline(batch, gamma, group):
     obs, returns, alive = (x.unflatten(1, (-1, group)) for x in (batch.obs, returns, batch.alive))
     baseline = linear_fit(obs, returns, alive).flatten(1)
     _, variance = moments(returns.flatten(1) - baseline, batch.alive, 1)
-    floor = 0.3 * variance.sqrt().mean()  # some steps have next to no spread
+    floor = 0.3 * variance.sqrt().mean()  # some steps have next to no spread (those after every end count, as 0)
     return baseline, (variance + floor**2 + 1e-8).sqrt()
 
 
@@ -502,7 +502,7 @@ def linear_schedule(first, last, progress):
 
 
 def begin_refinement(agent, args):
-    """From here on the noise is set, not learned; where starts are now flown in groups, V starts as their baseline."""
+    """From here on the noise is set, not learned; where starts are flown in groups, V begins anew as their baseline."""
     if args.log_std_refine is not None:
         nn.init.constant_(agent.actor_logstd, args.log_std_refine)
     if args.flights_per_start > 1:

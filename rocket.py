@@ -1,10 +1,10 @@
 """Rockets without any environment: vehicle, Earth and target orbit, equations of motion, orbits, rewards.
 
 Reading order: the tables (`Engine`, `Burn`, `Rocket`; `ROCKET` is the paper's), what cannot fly, the missions, what
-differs from flight to flight (`Dispersion`), the equations of motion (`ascent`), the geometry of orbits, the five parts
-of the reward. Functions of a state without memory; nothing is imported but NumPy, and `ascent`, `orbit_vectors` and
-`specific_energy` take CasADi symbols, too. `rocket_env.py` flies them: time grid, events, RK4, cut-off. Every name here
-is also one of `envs`.
+differs from flight to flight (`Dispersion`), the equations of motion (`ascent`), the geometry of orbits, what a policy
+is given of a rocket, the five parts of the reward. Functions of a state without memory; nothing is imported but NumPy,
+and `ascent`, `orbit_vectors` and `specific_energy` take CasADi symbols, too. `rocket_env.py` flies them: time grid,
+events, RK4, cut-off. Every name here is also one of `envs`.
 """
 
 from __future__ import annotations
@@ -718,7 +718,7 @@ def local_frame(y, normal):
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The five parts of the reward (the paper says what each is for and gives no formula: these are ours)
+# What a policy is given of a rocket
 # ---------------------------------------------------------------------------------------------------------------------
 
 
@@ -733,8 +733,8 @@ def policy_constants(rocket: Rocket) -> dict:
 
     `axes` (3, 3), rows towards the perigee, along the semi-latus rectum and normal to the plane; `units` (7,) of r, v
     and m (the Earth's radius, circular speed there, the dry mass); angular momentum `h_target` and eccentricity vector
-    `e_target` (3,); `phases`, what is observed of each burn; `steps` of the longest flight; `mean_flight` (steps + 1,
-    7), learnt from dispersed flights, and the `differences` (7,) from it.
+    `e_target` (3,); `phases`, what is observed of each burn; `steps`, end_time / dt; `mean_flight`, (ceil(steps) + 1,
+    7), learnt from dispersed flights (later steps take its last row), and the `differences` (7,) from it.
     """
     axes, steps = target_axes(rocket), rocket.end_time / rocket.dt
     h_target, e_target = target_orbit(rocket.target, rocket.mu)
@@ -749,6 +749,11 @@ def policy_constants(rocket: Rocket) -> dict:
         "differences": DIFFERENCES,
         "mean_flight": np.zeros((int(np.ceil(steps)) + 1, len(DIFFERENCES))).tolist(),
     }
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The five parts of the reward (the paper says what each is for and gives no formula: these are ours)
+# ---------------------------------------------------------------------------------------------------------------------
 
 
 def orbital_reward(distance, next_distance):

@@ -49,16 +49,16 @@ from rocket import (
 )
 
 ACTION_FRAMES = ("eci", "local")
-STIFF = 0.25  # drag's rate |D| / (m |v_rel|) times the step, from which a step is cut
+STIFF = 0.25  # drag's derivative by the speed, rho Cd S |v| / m, times the step: from here on a step is cut
 
 
 class RocketVectorEnv(BatchedEnv):
     """N launches of a mission's rocket into its orbit, steered by the thrust direction; 2 s steps, exact events.
 
-    Observation: [r (3) m, v (3) m/s, m kg, t_norm, phi] in ECI, t_norm = 1 - t / end_time (961 s), phi in 0 to 1 the
-    phase at the step's start (the paper's 0 to 3, over 3; a burn is a phase). Action: the thrust direction, any length
-    but 0 (BadInput), normalised here; with `action_frame="local"` by (up, along-track, cross-track of the target plane)
-    at the step's start, then held in ECI. A step is one RK4 step between events: staging, a stage that runs dry
+    Observation: [r (3) m, v (3) m/s, m kg, t_norm, phi] in ECI, t_norm = 1 - t / rocket.end_time (961 s), phi in 0 to 1
+    the phase at the step's start (the paper's 0 to 3, over 3; a burn is a phase). Action: the thrust direction, any
+    length but 0 (BadInput), normalised here; with `action_frame="local"` by (up, along-track, cross-track of the target
+    plane) at the step's start, then held in ECI. A step is one RK4 step between events: staging, a stage that runs dry
     (`table_isp`), the end of the episode.
 
     With `dispersion` D > 0 each group of `flights_per_start` episodes draws its k standard scores, clipped at +-3 (see
@@ -72,18 +72,19 @@ class RocketVectorEnv(BatchedEnv):
     reaches the target's: the root within the step, to 1e-10, ends the episode.
 
     Every flight also ends below altitude 0 (a crash), and at `end_time`. With cut-off and dispersion the burn-out of
-    its own last stage takes the place of `end_time` (t_norm may end below 0), as long as that is the rocket's and the
-    last burn's end.
+    its own last stage takes the place of `end_time` (t_norm may end below 0), unless `end_time` was changed or is not
+    the last burn's end.
 
     Reward: the sum of the five parts R_orbital, R_trajectory, R_guidance, R_penalties and R_terminal, each a function
     of `rocket.py`. `final_info`, (N,) each: `error_norm` (and `error` (N, 6), the terminal error in ECI), `a_km e i_deg
     raan_deg argp_deg final_mass_kg final_time_s max_altitude_km` (at the steps' ends), the parts' sums,
     `episodic_return`, `points` (`precision_points`), `crashed`; with dispersion `draw` (N, k) and `dry`, out of fuel.
 
-    Attributes that only training changes, to be set before a `reset`: `mass_weight`, `trajectory_weight`,
-    `guidance_weight`, `guidance` (a key of `REFERENCE_PITCH`), `end_time` (s, at most the last phase's end),
+    Attributes for training alone, to be set before a `reset`: `guidance` (a key of `REFERENCE_PITCH`),
     `flights_per_start` (`BatchedEnv`; of each draw of a `reset`) and `terminal_scale`, a curriculum: the *reward* pays
-    R_terminal with it, `final_info` reports it with `TERMINAL_SCALE`.
+    R_terminal with it, `final_info` reports it with `TERMINAL_SCALE`. Our training leaves the others as they are:
+    `mass_weight` (a price per `mass_unit`), `trajectory_weight`, `guidance_weight` and `end_time` (s, at most the last
+    phase's end).
     """
 
     metadata = {**BatchedEnv.metadata, **DRAWN}
@@ -240,8 +241,9 @@ class RocketVectorEnv(BatchedEnv):
             obs[:, 9:] = self.draw
         if self.dispersion and not self.observe_mass:
             obs[:, 6] = self._computed_mass()
-        clock, _ = self._schedule()
-        obs[:, 7:9] = clock[2:].T
+        (*_, phi), _ = self._schedule()
+        obs[:, 7] = (1 - self.time / self.rocket.end_time) * self.observe_phase
+        obs[:, 8] = phi * self.observe_phase
         return obs
 
     def _schedule(self):
@@ -252,7 +254,7 @@ class RocketVectorEnv(BatchedEnv):
         return clock[:, self.t], arc[self.t]
 
     def _work_out(self, t, vehicles):
-        """Begin and end (s), t_norm and phi as observed before the steps t (N,), (4, N); the arcs they begin in, (N,).
+        """Begin and end (s) of the steps t (N,) and the phase phi before them, (3, N); the arcs they begin in, (N,).
 
         After an episode's last step phi is still that one's.
         """
@@ -260,8 +262,7 @@ class RocketVectorEnv(BatchedEnv):
         time, end = (np.where(k >= self._steps, self._latest, dt * k) for k in (t, t + 1))
         arc = (ends <= dt * np.minimum(t, self._steps - 1)).sum(axis=0)
         phi = np.minimum(arc, self._last_phase) / max(self._last_phase, 1)
-        t_norm = 1 - time / self.rocket.end_time
-        return np.array([time, end, t_norm * self.observe_phase, phi * self.observe_phase]), arc
+        return np.array([time, end, phi]), arc
 
     def _computed_mass(self):
         """The flight computer's mass (N,) in kg: the nominal burn's, counted from the staging that has just been."""
@@ -284,7 +285,7 @@ class RocketVectorEnv(BatchedEnv):
 
     def _advance(self, actions):
         t, u, before = self.t, self._directions(actions), self.y
-        (begin, end, *_), arc = self._schedule()
+        (begin, end, _), arc = self._schedule()
         duration, phase, done = end - begin, np.minimum(arc, self._last_phase), t + 1 == self._steps
         self.y = self._fly(before, u, begin, end, duration, self._everyone, arc)
         if self.cutoff:

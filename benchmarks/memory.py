@@ -111,6 +111,12 @@ EXPERIMENTS = {
             "ratio_of_sums": "ratio of sums of those",
         },
     ),
+    "one_phase": Experiment(
+        "Double integrator, nothing hidden, by the command of results/di",
+        {"memory_0": "L_mem 0", "../../di": "L_mem 32"},
+        {"ratio_of_sums": "ratio of sums", "ratio_mean": "mean ratio", "ratio_p95": "p95"},
+        drawn=False,
+    ),
     "nominal": Experiment(
         "Rocket, cut-off, nominal flight: the policies that the next rows begin with",
         rocket_rows("rocket_cutoff"),

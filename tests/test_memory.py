@@ -202,9 +202,15 @@ def test_an_empty_folder_is_one_line(tmp_path, monkeypatch):
         memory.main()
 
 
+def di_jobs(experiment):
+    """The jobs of the double integrator whose results folder's name begins so."""
+    jobs = run_seeds.read_jobs(ROOT / "benchmarks" / "memory_di_jobs.txt")
+    return [job for job in jobs if job.results.parent.name.startswith(experiment)]
+
+
 def test_every_row_of_the_tables_has_its_three_jobs():
     """Seeds 1 to 3 of each, by one command that differs from its neighbours by what the row says alone."""
-    jobs, found = run_seeds.read_jobs(ROOT / "benchmarks" / "memory_di_jobs.txt"), []
+    jobs, found = di_jobs("hidden"), []
     hidden = {"hidden_phase": "observe_phase", "hidden_velocity": "observe_velocity"}
     for name, observed in hidden.items():
         for row in memory.EXPERIMENTS[name].rows:
@@ -257,3 +263,13 @@ def test_the_rockets_rows_are_the_shipped_commands_but_for_what_they_say(tmp_pat
             theirs = shipped[result, job.args["seed"]]
             different = {key: value for key, value in job.args.items() if value != theirs[key] and key != "checkpoint"}
             assert different == CHANGED[job.results.name], shlex.join(job.command)
+
+
+def test_one_phase_is_flown_by_the_shipped_command_without_memory():
+    """L_mem 32 is the front page's result here, too."""
+    shipped = run_seeds.read_jobs(ROOT / "benchmarks" / "result_jobs.txt")
+    shipped = [job.args for job in shipped if job.results == Path("results/di")]
+    jobs = di_jobs("one_phase")
+    assert [job.args for job in jobs] == [args | {"memory_length": 0} for args in shipped[:3]]
+    assert {job.results for job in jobs} == {Path("results/memory/one_phase/memory_0")}
+    assert set(memory.EXPERIMENTS["one_phase"].rows) == {"memory_0", "../../di"}

@@ -357,6 +357,7 @@ def test_cutoff_of_many_flights_is_exact(v):
                 time = final["final_time_s"][n]
                 assert 2 * t < time <= 2 * t + 2
                 assert info["final_obs"][n, 6] == pytest.approx(v.dry_mass + v.last_flow * (v.end - time), abs=1e-6)
+                assert info["final_obs"][n, 7] == pytest.approx(1 - time / v.end, abs=1e-12)
                 cuts += 1
             running &= ~terminated
         assert all(energy(s) < v.goal_energy for s in obs[running]), "none goes on with more than the target's energy"
