@@ -102,6 +102,7 @@ EXPERIMENTS = {
         {
             **lengths(0, 8, 32, 100),
             "shown_memory_0": "L_mem 0, both shown",
+            "../clock/memory_0": "L_mem 0, both and a clock's hands",
             "shown": "L_mem 32, both shown",
         },
         {

@@ -214,6 +214,8 @@ def test_every_row_of_the_tables_has_its_three_jobs():
     hidden = {"hidden_phase": "observe_phase", "hidden_velocity": "observe_velocity"}
     for name, observed in hidden.items():
         for row in memory.EXPERIMENTS[name].rows:
+            if row == "../clock/memory_0":  # trained by benchmarks/clock.py, not by a list
+                continue
             mine = [job for job in jobs if job.results == Path(f"results/memory/{name}/{row}")]
             assert sorted(job.args["seed"] for job in mine)[:3] == [1, 2, 3], (name, row)
             for job in mine:

@@ -1,0 +1,52 @@
+"""A small problem's script whose policy sees time as a clock's hands, too: what then is left for the memory?
+
+    python benchmarks/clock.py ppo_gtrxl_di.py --env-id DoubleIntegratorWaypoints-v0 --memory-length 0 --seed 1
+
+Behind the script stand its flags; all of them work, --eval-only and --resume, too. From one step to the next tau, time
+as a number from 0 to 1, changes by a hundredth; its sines and cosines by up to one. The policy's input is all that
+differs. results/memory/clock holds what came out.
+"""
+
+from __future__ import annotations
+
+import importlib
+import math
+import sys
+from pathlib import Path
+
+import torch
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+import runs  # noqa: E402
+from envs import BadInput, refuse_unless  # noqa: E402
+
+SCRIPTS = ("ppo_gtrxl_di.py", "ppo_gtrxl_vdp.py")
+TURNS = (1.0, 2.0, 4.0, 8.0, 16.0)  # of each hand, over an episode
+TAU = {3: 2, 6: 4}  # its place in an observation of one phase, of several
+
+
+def with_hands(features):
+    """A script's `features` and, behind them, sin and cos of 2 pi k tau for k in TURNS: (..., inputs + 10)."""
+
+    def seen(agent, obs):
+        tau = obs[..., TAU[obs.shape[-1]], None]
+        angle = 2 * math.pi * tau * torch.tensor(TURNS, dtype=obs.dtype, device=obs.device)
+        return torch.cat([features(agent, obs), angle.sin(), angle.cos()], dim=-1)
+
+    return seen
+
+
+def main(argv):
+    script, *flags = argv or [""]
+    try:
+        refuse_unless(script in SCRIPTS, "the script", repr(script), f"must be one of {', '.join(SCRIPTS)}")
+    except BadInput as error:
+        runs.fail(error)
+    module = importlib.import_module(script.removesuffix(".py"))
+    module.features = with_hands(module.features)
+    sys.argv = [script, *flags]
+    runs.start(module.main)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
