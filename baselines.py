@@ -226,7 +226,14 @@ def solver(env_id: str, defect: Callable, in_circles: bool):
         "lbg": np.append(dynamics, np.full(circles, -np.inf)),
         "ubg": np.append(dynamics, np.ones(circles)),
     }
-    return ca.nlpsol("optimum", "ipopt", program(problem, defect, in_circles), options), arguments
+    try:
+        symbols = program(problem, defect, in_circles)
+    except RuntimeError as error:  # CasADi's, of a symbol whose truth Python asks for
+        if "truth value" not in str(error):
+            raise
+        allowed = "no `if`, `min` or `max` of Python, but NumPy's `where`, `minimum` and `maximum`"
+        raise NoOptimum(f"the dynamics of {env_id} decide by a value; they may hold {allowed}") from error
+    return ca.nlpsol("optimum", "ipopt", symbols, options), arguments
 
 
 @cache

@@ -380,9 +380,9 @@ class Run:
         return self
 
     def solve_reference(self):
-        """The optimum that evaluations fly, before anything is learned: an orbit out of reach is said at once."""
-        seed = TRAINING_EVAL_SEED if self.args.eval_every else self.args.eval_seed
-        evaluate.optimum(self.args.env_id, seed, self.args.eval_starts)
+        """The optima that evaluations fly, before anything is learned: one that does not exist is said at once."""
+        for seed in [TRAINING_EVAL_SEED] * (self.args.eval_every > 0) + [self.args.eval_seed]:
+            evaluate.optimum(self.args.env_id, seed, self.args.eval_starts)
 
     def __exit__(self, kind, error, traceback):
         if self.writer:

@@ -472,6 +472,21 @@ def test_eval_every_uses_starts_of_its_own(tmp_path, monkeypatch):
     assert [step for step, _ in scalars(run_folder())["eval/ratio_of_sums"]] == [200, 300]
 
 
+@pytest.mark.parametrize("eval_every", [0, 2])
+def test_the_reported_starts_have_an_optimum_before_anything_is_learned(tmp_path, monkeypatch, eval_every):
+    def refuse(env_id, x0):
+        if np.array_equal(x0, baselines.starts(77, 10)):
+            raise baselines.NoOptimum("start 3 has none")
+        return reference(env_id, x0)
+
+    monkeypatch.chdir(tmp_path)
+    reference = baselines.reference
+    monkeypatch.setattr(baselines, "reference", refuse)
+    with pytest.raises(baselines.NoOptimum):
+        DI.main([*TINY, "--total-updates=3", f"--eval-every={eval_every}", "--eval-seed=77"])
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("seed", [0, 3])
 def test_no_evaluated_start_is_trained_on(seed):
     """Also where the seeds are the same: both draw uniformly from a generator of that seed."""
