@@ -323,7 +323,7 @@ def test_dynamics_that_decide_in_python_are_one_line(new_problem, decides):
     """A symbol has no truth value. The same by NumPy is solved."""
     phases = (Phase(steps=5, target=(0.0, 0.0), radius=0.05, R=0.1, Qf=20.0, bonus=20.0),)
     like = Problem("Decides-v0", lambda x, u: (x[1], decides(u)), 1.0, phases, x_max=(9.0, 9.0))
-    with pytest.raises(baselines.NoOptimum, match="^the dynamics of Decides-v0 decide by a value; they may hold no `if`"):
+    with pytest.raises(baselines.NoOptimum, match="^the dynamics of Decides-v0 decide by a value; .* no `if`"):
         reference(new_problem(like), np.zeros((1, 2)))
     by_numpy = replace(like, env_id="DecidesNot-v0", f=lambda x, u: (x[1], np.minimum(u, 0.5)))
     assert np.isfinite(reference(new_problem(by_numpy), np.full((1, 2), 0.5))["cost"]).all()
