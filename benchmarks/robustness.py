@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import gc
 import importlib
 import inspect
 import io
@@ -306,9 +307,11 @@ def fuzz_actions(count, seed=0):
 
 
 def resources():
-    """Resident memory in bytes and number of open files of this process (Linux)."""
+    """Resident memory in bytes, number of open files (Linux) and of living tensors of this process."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE"), len(os.listdir("/proc/self/fd"))
+    gc.collect()
+    tensors = sum(issubclass(type(thing), torch.Tensor) for thing in gc.get_objects())
+    return pages * os.sysconf("SC_PAGE_SIZE"), len(os.listdir("/proc/self/fd")), tensors
 
 
 def soak_in_child(pipe, argv):
@@ -327,7 +330,7 @@ def soak_in_child(pipe, argv):
 
 
 def soak(updates):
-    """Train for so many tiny updates: resident memory (bytes) and open files after each.
+    """Train for so many tiny updates: resident memory (bytes), open files and living tensors after each.
 
     AssertionError says after how many of them the child died, if it did.
     """
@@ -356,9 +359,11 @@ def main():
     print(f"{args.kills} kills, each resumed run ended with the uninterrupted one's bits: {dict(ended)}", flush=True)
     for fuzz in (fuzz_arguments, fuzz_checkpoints, fuzz_actions):
         print(f"{fuzz.__name__}, {args.fuzz} cases: {dict(fuzz(args.fuzz, args.seed))}", flush=True)
-    memory, files = soak(args.soak).T
-    growth = memory[-1] / memory[min(99, len(memory) - 1)] - 1
-    print(f"{args.soak} updates: memory {growth:+.2%} after the first 100, open files {min(files)} to {max(files)}")
+    memory, files, tensors = soak(args.soak).T
+    first = min(99, len(memory) - 1)
+    growth, more = memory[-1] / memory[first] - 1, tensors[-1] - tensors[first]
+    print(f"{args.soak} updates: memory {growth:+.2%} after the first 100, tensors {more:+d}", end=", ")
+    print(f"open files {min(files)} to {max(files)}")
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.error import ResetNeeded
-from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import RecordVideo, RenderCollection
 from PIL import Image
 
@@ -314,12 +313,6 @@ def test_bad_render_modes_and_render_before_reset_are_refused():
         gym.make("RocketAscent-v0", render_mode="ansi")
     with pytest.raises(ResetNeeded, match="call reset"):
         gym.make_vec("VanDerPol-v0", num_envs=2, render_mode="rgb_array").render()
-
-
-@pytest.mark.parametrize("env_id", IDS)
-def test_check_env_with_rendering(env_id, recwarn):
-    check_env(gym.make(env_id, render_mode="rgb_array").unwrapped)
-    assert not [str(w.message) for w in recwarn if "symmetric and normalized" not in str(w.message)]
 
 
 def test_gymnasiums_own_ways_to_collect_frames(tmp_path):

@@ -281,6 +281,7 @@ def test_events_and_ends_are_each_flights_own():
         for k in np.flatnonzero(ended & [k not in final for k in range(3)]):
             final[k] = info["final_info"]["final_time_s"][k], info["final_info"]["final_mass_kg"][k]
             final[k] += (info["final_info"]["crashed"][k], info["final_obs"][k, 7])
+            assert info["final_info"]["dry"][k]
     for k in range(3):
         dry = 4164 + 20 * z[k]["payload"] + 2480 * (1 + 0.005 * z[k]["dry_mass_3"])
         assert final[k][0] == pytest.approx(rows[k][3][1], rel=1e-14)

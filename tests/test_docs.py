@@ -1,11 +1,13 @@
 """The pages: their links, tables and commands, and the front page's numbers against the results."""
 
 import importlib
+import itertools
 import json
 import re
 import shlex
 from pathlib import Path
 
+import memory
 import numpy as np
 import pytest
 
@@ -73,7 +75,7 @@ def test_tables_are_whole_and_their_cells_short(page):
 
 @each_page
 def test_commands_name_what_is_there(page):
-    """Scripts and lists exist, and scripts that train accept the flags."""
+    """Scripts and lists exist, and scripts that train accept the flags and their values."""
     for words in command_lines(page):
         files = [word for word in words if word.endswith((".py", ".txt"))]
         assert all((ROOT / word).exists() for word in files), words
@@ -81,7 +83,9 @@ def test_commands_name_what_is_there(page):
         if not files or not files[0].startswith("ppo_gtrxl") or {"MyRocket-v0", "--help"} & set(words):
             continue
         script = importlib.import_module(files[0].removesuffix(".py"))
-        runs.read_flags(script.Args, words[words.index(files[0]) + 1 :])
+        args, typed = runs.read_flags(script.Args, words[words.index(files[0]) + 1 :])
+        if not any("runs/" in word for word in words):  # the reader's run, of which a page cannot know
+            runs.check(args, typed, script.ENV_IDS)
 
 
 def row_of(result):
@@ -141,6 +145,54 @@ def test_the_front_page_says_what_the_results_hold(result):
         for (_, *span), (values, digits, _) in zip(numbers, figures):
             assert not any(span) or span == [f"{end:.{digits}f}" for end in (min(values), max(values))]
     assert any(numbers_of(row["here"])[0][1:]) == (count > 1)  # as the last line below the table says
+
+
+def rows_below(heading):
+    """The cells of README's table whose head begins so, a list a row."""
+    lines = (ROOT / "README.md").read_text().splitlines()
+    (begin,) = [number for number, line in enumerate(lines) if line.startswith(heading)]
+    rows = itertools.takewhile(lambda line: line.startswith("|"), lines[begin + 2 :])
+    return [[cell.replace("**", "").replace("−", "-") for cell in cells(row)] for row in rows]
+
+
+def test_the_opponents_are_those_of_the_results():
+    laws = json.loads((ROOT / "results" / "rocket_dispersed" / "opponents.json").read_text())["laws"]
+    rows = rows_below("| law | what it knows beforehand |")
+    for name, (_, _, *shown) in zip(
+        ["policy", "nominal flight only", "replay", "tvlqr_energy", "replan"], rows, strict=True
+    ):
+        law = {key.removeprefix("dispersed_"): value for key, value in laws[name].items()}
+        assert float(shown[0]) == pytest.approx(law["error_median"], rel=0.03), name  # two digits
+        assert shown[1] == "{perigee_error_mean_km:+.{0}f} ± {perigee_error_std_km:.{0}f}".format(
+            len(shown[1].rpartition(".")[2]), **law
+        )
+        assert shown[2] == f"{100 * law['box_rate']:.3g} %", name
+
+
+def test_the_memorys_table_is_that_of_the_results():
+    """Medians and ranges over the seeds of results/memory, by the rows and keys that benchmarks/memory.py prints."""
+    hidden = memory.read(ROOT / "results" / "memory" / "hidden_velocity", memory.EXPERIMENTS["hidden_velocity"])
+    phase = memory.read(ROOT / "results" / "memory" / "hidden_phase", memory.EXPERIMENTS["hidden_phase"])
+    rocket = memory.read(ROOT / "results" / "memory" / "rocket", memory.EXPERIMENTS["rocket"])
+    columns = ["memory_0", "memory_32", "shown", "shown_memory_0"]
+    flown = ["memory_0", "../../rocket_dispersed", "oracle"]
+    velocity, waypoints, median, p95 = rows_below("| what is hidden | measured |")
+    found = [(velocity, hidden, columns, "ratio_of_sums"), (waypoints, phase, columns, "ratio_of_sums")]
+    found += [(median, rocket, flown, "dispersed_error_median"), (p95, rocket, flown, "dispersed_error_p95")]
+    for (_, _, *shown), runs_of, names, key in found:
+        for cell, name in zip(shown, names):
+            values = [run[key] for run in runs_of[name] if key in run]
+            if key == "ratio_of_sums" and runs_of is phase:
+                hits, _, cell = cell.partition("; ")
+                assert hits == f"{100 * np.median([run['hit_rate'] for run in runs_of[name]]):.0f} %", name
+            if not values:
+                assert cell == "–", name
+                continue
+            low, middle, high = min(values), np.median(values), max(values)
+            numbers = re.fullmatch(r"(\S+) \((\S+) to (\S+)\)", cell).groups()
+            assert list(numbers) == [
+                f"{x:.{len(n.partition('.')[2])}f}" for x, n in zip((middle, low, high), numbers)
+            ], name
 
 
 def test_the_front_page_s_problem_is_solved(new_problem):

@@ -134,6 +134,17 @@ def test_radius_curriculum(name, env_id, first, refine_from, progress, power):
     assert envs.bonus_width == (0.4 if refines else 0.0)
 
 
+@pytest.mark.parametrize("std, dispersion, scale", [
+    (1.0, 0, 0.005), (0.016, 0, 0.002), (0.0016, 0, 0.0002), (0.016, 1, 0.002), (0.0016, 1, 0.001),
+])  # fmt: skip
+def test_the_rockets_curriculum(std, dispersion, scale):
+    """R_terminal's scale is an eighth of the noise, within its bounds; guidance and groups are those of the flags."""
+    rocket, envs = importlib.import_module("ppo_gtrxl_rocket"), gym.make_vec("RocketAscentCutoff-v0", num_envs=1)
+    args = rocket.Args(guidance="knots", flights_per_start=16, dispersion=dispersion)
+    assert rocket.set_curriculum(envs, args, 0.5, False, std) == envs.flights_per_start == 16
+    assert envs.guidance == "knots" and envs.terminal_scale == pytest.approx(scale)
+
+
 @pytest.fixture
 def schedules(learner, asked, monkeypatch):
     """The entropy's coefficient, lambda and the learning rate that update `iteration` of 11 uses."""

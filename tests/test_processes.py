@@ -158,6 +158,15 @@ def parse(*argv):
     return runs.parse_args(script.Args, argv, script.ENV_OPTIONS, script.BUFFERS)[0]
 
 
+def test_processes_fly_starts_of_their_own(monkeypatch):
+    starts = []
+    for rank in (0, 1):
+        monkeypatch.setattr(runs, "process", lambda rank=rank: (rank, 2))
+        envs = runs.make_envs(script.Args(num_envs=5), {})
+        starts += envs.reset()[0][:, :2].tolist()
+    assert len(starts) == 5 and len({x for start in starts for x in start}) == 10
+
+
 def test_more_processes_than_environments(monkeypatch):
     monkeypatch.setenv("WORLD_SIZE", "4")
     with pytest.raises(SystemExit, match="--num-envs 3: must be at least the number of processes, 4"):

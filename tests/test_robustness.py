@@ -23,10 +23,10 @@ SCRIPT = ROOT / "ppo_gtrxl_di.py"
 # --- kills and signals ------------------------------------------------------------------------------------------------
 
 
-def test_ten_kills(robustness):
+def test_six_kills(robustness):
     """SIGKILL at random moments and in the middle of writes: the resumed run has the uninterrupted one's bits."""
-    ended = robustness.kill_and_resume(10)
-    assert sum(ended.values()) == 10 and ended["in a write"] >= 3, ended
+    ended = robustness.kill_and_resume(6)
+    assert sum(ended.values()) == 6 and ended["in a write"] >= 2, ended
 
 
 def begin(robustness, folder, *argv, limit=None):
@@ -73,12 +73,12 @@ def test_full_disk_leaves_the_old_checkpoint(robustness, tmp_path):
 
 
 def test_soak(robustness):
-    """After the first 100 of 300 tiny updates neither memory nor open files grow (benchmark: 2000).
+    """After the first 100 of 300 tiny updates neither memory, open files nor tensors grow (benchmark: 2000).
 
     TensorBoard's thread opens its file for each flush: the least of a hundred updates is what stays open.
     """
-    memory, files = robustness.soak(300).T
-    assert memory[-1] < 1.01 * memory[99]
+    memory, files, tensors = robustness.soak(300).T
+    assert memory[-1] < 1.01 * memory[99] and tensors[-1] == tensors[99]
     assert len(set(files.reshape(3, 100).min(axis=1))) == 1, files
 
 
@@ -99,15 +99,21 @@ def test_a_soak_whose_child_dies_ends(robustness, monkeypatch):
         signal.signal(signal.SIGALRM, before)
 
 
-@pytest.mark.parametrize("name", ["di", "rocket"])
-def test_4096_environments(robustness, tmp_path, monkeypatch, name):
+@pytest.mark.parametrize("name, number, steps", [("di", 4096, 50), ("rocket", 1024, 481)])
+def test_thousands_of_environments(robustness, tmp_path, monkeypatch, name, number, steps):
     monkeypatch.chdir(tmp_path)
     script = importlib.import_module(f"ppo_gtrxl_{name}")
-    argv = [*robustness.NETWORK, "--num-envs=4096", "--num-minibatches=32", "--update-epochs=1", "--total-updates=1"]
+    argv = [
+        *robustness.NETWORK,
+        f"--num-envs={number}",
+        "--num-minibatches=32",
+        "--update-epochs=1",
+        "--total-updates=1",
+    ]
     script.main([*argv, "--eval-starts=10", "--eval-every=0"])
     (run,) = Path("runs").iterdir()
-    steps = json.loads((run / "eval.json").read_text())["global_step"]
-    assert 4096 < steps <= 4096 * 481
+    flown = json.loads((run / "eval.json").read_text())["global_step"]
+    assert flown == number * steps if name == "di" else number < flown < number * steps  # some crash
 
 
 def test_freed_memory_is_kept():

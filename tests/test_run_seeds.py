@@ -67,13 +67,6 @@ def test_run_seeds_survives_a_restart(tmp_path):
     assert {path: path.stat().st_mtime_ns for path in tmp_path.glob("results/**/*")} == before
 
 
-@pytest.mark.parametrize("line", ["results/tiny", "results/tiny nothing.py --seed 1", "results/tiny README.md"])
-def test_lines_that_are_no_job(tmp_path, line):
-    process = start(tmp_path, [line])
-    _, errors = process.communicate(timeout=60)
-    assert process.returncode == 1 and errors.startswith("error: jobs.txt, line 1: ") and errors.count("\n") == 1
-
-
 def test_a_job_with_a_bad_flag_stops_before_any_training(tmp_path):
     process = start(tmp_path, [f"results/tiny ppo_gtrxl_di.py {TINY}", "results/tiny ppo_gtrxl_di.py --gamma 7"])
     _, errors = process.communicate(timeout=60)

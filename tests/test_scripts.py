@@ -4,6 +4,7 @@ import ast
 import dataclasses
 import hashlib
 import importlib
+import importlib.machinery
 import json
 import math
 import os
@@ -15,6 +16,7 @@ import shutil
 import subprocess
 import sys
 import time
+import types
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -117,9 +119,9 @@ def imported(nodes):
 
 
 # each imports only those before it
-ROOMS = ["rocket", "envs", "rocket_baselines", "baselines", "opponents", "evaluate", "comparison", "figures"]
-ROOMS += ["animation", "runs"]
-LAZILY = {"evaluate": {"comparison", "figures", "animation"}, "comparison": {"figures"}, "envs": {"animation"}}
+ROOMS = ["rocket", "batched", "rocket_env", "envs", "rocket_baselines", "baselines", "opponents", "evaluate"]
+ROOMS += ["comparison", "figures", "animation", "runs"]
+LAZILY = {"evaluate": {"comparison", "figures", "animation"}, "comparison": {"figures"}, "batched": {"animation"}}
 
 
 def test_imports_point_one_way():
@@ -141,7 +143,8 @@ def test_imports_point_one_way():
         assert "comparison" not in top and "animation" not in top and ("figures" not in top or draws), path
 
 
-LIGHT = {"rocket": {"torch", "casadi", "scipy", "gymnasium"}, "envs": {"torch", "casadi", "scipy"}}
+LIGHT = {"rocket": {"torch", "casadi", "scipy", "gymnasium"}}
+LIGHT |= dict.fromkeys(["batched", "rocket_env", "envs"], {"torch", "casadi", "scipy"})
 LIGHT |= {"rocket_baselines": {"torch"}, "baselines": {"torch"}, "evaluate": {"torch", "casadi"}}
 LIGHT |= {"opponents": {"torch"}, "comparison": {"torch", "casadi"}}
 LIGHT |= {"figures": {"torch", "casadi"}, "animation": {"torch", "casadi"}}
@@ -310,6 +313,46 @@ def test_smoke_run_logs_the_tags(smoke):
     assert rates == pytest.approx([first, last], rel=1e-6)
 
 
+def test_what_is_logged_is_what_was_flown_and_learned(tmp_path, monkeypatch, capsys):
+    """Every loss, and the mean return as the environment has it, unscaled; the printed lines say the same."""
+    monkeypatch.chdir(tmp_path)
+    seen, end_update = [], runs.Run.end_update
+    record = lambda run, *inputs: [seen.append(inputs), end_update(run, *inputs)]  # noqa: E731
+    monkeypatch.setattr(runs.Run, "end_update", record)
+    DI.main([*TINY, "--total-updates=2", "--eval-every=0"])
+    logged = scalars(run_folder())
+    printed = re.findall(r"^update .*return +(\S+)  cost.*  hits +\d+%", capsys.readouterr().out, flags=re.MULTILINE)
+    assert len(seen) == len(printed) == 2
+    for k, (_, _, episodes, losses, _) in enumerate(seen):
+        assert losses["value_loss"] > 0 and losses.keys() == set(LOSSES.split())
+        for name, value in losses.items():
+            assert logged[f"losses/{name}"][k][1] == pytest.approx(value, rel=1e-6), name
+        mean = 40.0 * episodes["hit"].mean() - episodes["cost"].mean()  # the bonus of the circle, less J
+        assert logged["charts/episodic_return"][k][1] == pytest.approx(mean, rel=1e-6)
+        assert float(printed[k]) == pytest.approx(mean, abs=0.01)
+
+
+def test_flags_of_the_machine(tmp_path, monkeypatch):
+    """They reach torch, and Weights and Biases where it is there."""
+    monkeypatch.chdir(tmp_path)
+    compiled, tracked, threads = [], [], torch.get_num_threads()
+    monkeypatch.setattr(torch, "compile", lambda function: [compiled.append(function.__name__), function][1])
+    monkeypatch.setattr(torch.backends.cudnn, "deterministic", True)
+    wandb = types.ModuleType("wandb")
+    wandb.__spec__, wandb.init = importlib.machinery.ModuleSpec("wandb", None), lambda **names: tracked.append(names)
+    monkeypatch.setitem(sys.modules, "wandb", wandb)
+    flags = ["--torch-compile", "--num-threads=1", "--no-torch-deterministic", "--track", "--wandb-project-name=mine"]
+    torch.set_num_threads(2)
+    try:
+        DI.main([*TINY, "--total-updates=1", *flags])
+        assert torch.get_num_threads() == 1
+    finally:
+        torch.set_num_threads(threads)
+    assert compiled == ["encode", "encode_step"] and not torch.backends.cudnn.deterministic
+    (names,) = tracked
+    assert (names["project"], names["name"]) == ("mine", run_folder().name)
+
+
 def test_smoke_run_saves_the_averaged_weights(smoke):
     _, folder, env_id, *_ = smoke
     (run,) = (folder / "runs").iterdir()
@@ -453,13 +496,6 @@ def test_log_std_of_a_checkpoint_and_of_the_user(trained, fresh_folder, monkeypa
         fresh_folder(name)
         DI.main([*TINY, f"--checkpoint={checkpoint}", "--total-updates=1", f"--noise={noise}", *flags])
     assert seen == [safetensors.torch.load_file(checkpoint)["actor_logstd"].item(), -1.5]
-
-
-def test_noise_falls_to_minus_eight(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    DI.main([*TINY, "--total-updates=2", "--noise=schedule", "--log-std-final=-8"])
-    state = torch.load(run_folder() / "training_state.pt", weights_only=True)
-    assert state["agent"]["actor_logstd"].item() == -8.0
 
 
 def test_eval_every_uses_starts_of_its_own(tmp_path, monkeypatch):
@@ -671,18 +707,18 @@ def fresh_folder(tmp_path, monkeypatch):
     return change
 
 
-def stop_in_update(monkeypatch, number, error, losses_before=3):
+def stop_in_update(monkeypatch, number, error, losses_before=3, script=DI):
     """Raise `error` in the middle of update `number`: the weights have moved since its start."""
-    loss, calls = DI.ppo_loss, []
+    loss, calls = script.ppo_loss, []
 
     def stops(*inputs):
         calls.append(1)
         if len(calls) == 4 * (number - 1) + 1 + losses_before:  # TINY has 4 minibatches an update
-            monkeypatch.setattr(DI, "ppo_loss", loss)
+            monkeypatch.setattr(script, "ppo_loss", loss)
             raise error
         return loss(*inputs)
 
-    monkeypatch.setattr(DI, "ppo_loss", stops)
+    monkeypatch.setattr(script, "ppo_loss", stops)
 
 
 def test_same_seed_twice(fresh_folder):
@@ -752,6 +788,22 @@ def test_ctrl_c_and_resume(uninterrupted, fresh_folder, monkeypatch, capsys):
     assert state_of(run_folder())["progress"]["total_updates"] == 2
     assert not (run_folder() / "eval.json").exists()
     assert_resumes(uninterrupted)
+
+
+def test_a_dispersed_rocket_is_resumed_bit_for_bit(fresh_folder, monkeypatch):
+    """With what only it has: the mean flight that it learns, in both networks, and each environment's own vehicle."""
+    rocket, argv = importlib.import_module("ppo_gtrxl_rocket"), ["--env-id=TwoStageLEO-v0", "--dispersion=1"]
+    argv += ["--flights-per-start=2", "--total-updates=3", "--eval-every=0"]
+    fresh_folder("whole")
+    rocket.main([*TINY, *argv])
+    whole = state_of(run_folder())
+    fresh_folder("stopped")
+    stop_in_update(monkeypatch, 3, KeyboardInterrupt(), script=rocket)
+    with pytest.raises(KeyboardInterrupt):
+        rocket.main([*TINY, *argv])
+    rocket.main([f"--resume={run_folder()}"])
+    assert_same_bits(state_of(run_folder()), whole)
+    assert whole["agent"]["mean_flight"].any()
 
 
 def test_resume_after_a_crash(uninterrupted, fresh_folder, monkeypatch):
@@ -936,19 +988,20 @@ def flag(name):
     return f"--{name.replace('_', '-')}"
 
 
-NUMBERS = [f for f in dataclasses.fields(DI.Args) if re.search(r"\b(int|float)\b", str(f.type))]
+FIELDS = {field.name: (module, field) for module in reversed(MODULES) for field in dataclasses.fields(module.Args)}
+NUMBERS = [pair for pair in FIELDS.values() if re.search(r"\b(int|float)\b", str(pair[1].type))]
 POSITIVE = "total_updates num_envs num_minibatches update_epochs embed_dim num_heads mlp_dim hidden_dim"
 POSITIVE += " eval_starts reward_scale max_grad_norm target_kl radius_curriculum flights_per_start"
 
 
-@pytest.mark.parametrize("field", NUMBERS, ids=lambda field: field.name)
-def test_every_number_has_a_range(refuses, field):
+@pytest.mark.parametrize("module, field", NUMBERS, ids=[field.name for _, field in NUMBERS])
+def test_every_number_has_a_range(refuses, module, field):
     """NaN, infinities and absurd values in every numeric flag, and zero where nothing can be of size zero."""
     values = ["-9", "1" + "0" * 20] + (["0"] if field.name in POSITIVE.split() else [])
     if "float" in str(field.type):
         values += ["nan", "inf", "-inf"]
     for value in values:
-        message = refuses(f"{flag(field.name)}={value}")
+        message = refuses(f"{flag(field.name)}={value}", script=module)
         low, high = re.search(r"must be between (\S+) and (\S+)$", message).groups()
         assert re.match(rf"error: {flag(field.name)} \S+: ", message), message
         number = float(re.search(r" (\S+): ", message).group(1))
@@ -957,7 +1010,8 @@ def test_every_number_has_a_range(refuses, field):
 
 
 def test_numbers_are_all_there():
-    assert {field.name for field in NUMBERS} >= set(POSITIVE.split()) and len(NUMBERS) >= 28
+    names = {field.name for _, field in NUMBERS}
+    assert names >= {*POSITIVE.split(), "mass_weight", "dispersion"} and len(NUMBERS) >= 30
 
 
 @pytest.mark.parametrize("name", ["gamma", "gae_lambda", "clip_coef", "learning_rate"])

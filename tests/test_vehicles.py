@@ -249,13 +249,15 @@ def test_a_bad_file_of_vehicles_is_left_out_with_a_line(tmp_path):
     good = (ROOT / "vehicles" / "two_stage_leo.py").read_text()
     (tmp_path / "vehicles" / "a_bad_one.py").write_text(good.replace("payload=20e3", "payload=-20e3"))
     (tmp_path / "vehicles" / "b_foreign.py").write_text(good.replace("TwoStageLEO-v0", "VanDerPol-v0"))
+    (tmp_path / "vehicles" / "c_broken.py").write_text(good.replace("payload=20e3", "payload=heavy"))
     (tmp_path / "vehicles" / "z_good.py").write_text(good)
     code = "import envs, gymnasium; print(*envs.ROCKETS); print(gymnasium.make('TwoStageLEO-v0').reset()[0][6])"
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=60)
     assert done.stdout.split() == [FIXED, CUTOFF, LEO, "564500.0"]
-    first, second = done.stderr.splitlines()
+    first, second, third = done.stderr.splitlines()
     assert first == "vehicles/a_bad_one.py is left out: a rocket's payload is -20000.0; it must not be negative"
     assert second.startswith("vehicles/b_foreign.py is left out: env_id is 'VanDerPol-v0'")
+    assert third == "vehicles/c_broken.py is left out: NameError: name 'heavy' is not defined"
 
 
 # --- one burn, three burns, another site and target -------------------------------------------------------------------
