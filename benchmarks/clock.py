@@ -2,8 +2,8 @@
 
     python benchmarks/clock.py ppo_gtrxl_di.py --env-id DoubleIntegratorWaypoints-v0 --memory-length 0 --seed 1
 
-Behind the script stand its flags; all of them work, --eval-only and --resume, too. From one step to the next tau, time
-as a number from 0 to 1, changes by a hundredth; its sines and cosines by up to one. The policy's input is all that
+Behind the script stand its flags; all of them work, --eval-only and --resume, too. Over 100 steps tau, time as
+a number from 0 to 1, changes by a hundredth from one to the next; its sines and cosines by up to one. The policy's input is all that
 differs. results/memory/clock holds what came out.
 """
 
@@ -18,7 +18,6 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import runs  # noqa: E402
-from envs import BadInput, refuse_unless  # noqa: E402
 
 SCRIPTS = ("ppo_gtrxl_di.py", "ppo_gtrxl_vdp.py")
 TURNS = (1.0, 2.0, 4.0, 8.0, 16.0)  # of each hand, over an episode
@@ -38,10 +37,8 @@ def with_hands(features):
 
 def main(argv):
     script, *flags = argv or [""]
-    try:
-        refuse_unless(script in SCRIPTS, "the script", repr(script), f"must be one of {', '.join(SCRIPTS)}")
-    except BadInput as error:
-        runs.fail(error)
+    if script not in SCRIPTS:
+        runs.fail(f"the script is {script!r}; it must be one of {', '.join(SCRIPTS)}")
     module = importlib.import_module(script.removesuffix(".py"))
     module.features = with_hands(module.features)
     sys.argv = [script, *flags]
