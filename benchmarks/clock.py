@@ -2,9 +2,9 @@
 
     python benchmarks/clock.py ppo_gtrxl_di.py --env-id DoubleIntegratorWaypoints-v0 --memory-length 0 --seed 1
 
-Behind the script stand its flags; all of them work, --eval-only and --resume, too. Over 100 steps tau, time as
-a number from 0 to 1, changes by a hundredth from one to the next; its sines and cosines by up to one. The policy's input is all that
-differs. results/memory/clock holds what came out.
+Behind the script stand its flags; all of them work, --eval-only and --resume, too. Over 100 steps tau, time as a number
+from 0 to 1, changes by a hundredth from one to the next, its sines and cosines by up to one. The policy's input is all
+that differs. results/memory/clock holds what came out.
 """
 
 from __future__ import annotations
