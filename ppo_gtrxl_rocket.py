@@ -1,6 +1,6 @@
 """PPO with a Gated Transformer-XL on a four-phase rocket ascent, measured against the true optimum in the same run.
 
-    python ppo_gtrxl_rocket.py --seed 1  # the paper's 961 s by the defaults; the result's flags: results/rocket_fixed
+    python ppo_gtrxl_rocket.py --seed 1  # the paper's 961 s, as results/rocket_fixed
     python ppo_gtrxl_rocket.py --seed 1 --env-id RocketAscentCutoff-v0  # free final time; its flags: README.md
     python ppo_gtrxl_rocket.py --eval-only --checkpoint results/rocket_fixed/agent.safetensors
 
@@ -56,7 +56,7 @@ class Args:
     observe_draw: bool = False  # show the draw to the policy: an oracle
     observe_mass: bool = False  # show the true mass of a dispersed rocket, not the flight computer's
     action_frame: str = "local"  # the thrust direction's axes: local (up, along-track, cross-track) or eci
-    guidance: str = "none"  # in training, R_guidance's early reference pitch: none (no R_guidance), linear or knots
+    guidance: str = "auto"  # R_guidance's pitch in training: none, linear or knots (auto: knots, with cut-off none)
     mass_weight: float = 2.0  # cut-off: factor on `mass_rewards`, which compares 8 or more flights of a start
     reward_scale: float = 0.2  # factor on the rewards in training; everything logged is unscaled
 
@@ -68,7 +68,7 @@ class Args:
     mlp_dim: int = 64  # width of the position-wise MLP
     hidden_dim: int = 64  # width of the hidden layer of each head
     memory_noise: float = 0.1  # spread of the memory before an episode (Algorithm 1, line 5; the value is ours)
-    memory_noise_final: float | None = None  # the same in the last update (linear in between; none: --memory-noise)
+    memory_noise_final: float | None = 0.0  # the same in the last update (linear in between; none: --memory-noise)
 
     # PPO (docs/decisions.md has Table 1's beside ours)
     total_updates: int = 500  # number of updates
@@ -89,8 +89,8 @@ class Args:
     target_kl: float | None = 0.02  # the KL divergence from which an update takes no further step (none: no limit)
     lr_schedule: str = "std"  # linear, or std: --learning-rate times the policy's standard deviation
     noise: str = "schedule"  # who sets the log-std: learned (the optimiser) or schedule (linear)
-    log_std: float = -1.4  # initial log of the policy's std in the action's unit, -8 to 0.5 (else a --checkpoint's)
-    log_std_final: float = -5.0  # log-std of the last update, where it is not learned to the end
+    log_std: float = -1.0  # initial log of the policy's std in the action's unit, -8 to 0.5 (else a --checkpoint's)
+    log_std_final: float = -6.0  # log-std of the last update, where it is not learned to the end
     flights_per_start: int = 32  # flights of each start or draw, compared with one another: 16 or more (1: the paper)
     refine_from: float | None = None  # part of the updates after which the refinement begins (none: never)
     log_std_refine: float | None = None  # log-std at the refinement's beginning (none: as it is)
@@ -162,9 +162,8 @@ def shape_rewards(envs, args, progress, batch, episodes):
     if weight:
         group_size = args.flights_per_start if args.dispersion else len(episodes["error"])
         paid = weight * mass_rewards(episodes, envs.rocket, envs.terminal_scale, group_size)
-        last = batch.alive.sum(0).long() - 1
         mine = torch.as_tensor(runs.own_part(paid, envs.num_envs) * args.reward_scale).to(batch.rewards)
-        batch.rewards[last, torch.arange(envs.num_envs)] += mine
+        batch.rewards[batch.alive.sum(0).long() - 1, torch.arange(envs.num_envs)] += mine
 
 
 def set_curriculum(envs, args, progress, refines, std):
@@ -173,7 +172,8 @@ def set_curriculum(envs, args, progress, refines, std):
     R_terminal's scale follows the noise, which scatters the ends of the flights by about std / 10: std / 8, at most
     TERMINAL_SCALE, on dispersed flights at least 0.001 (smaller was no better).
     """
-    envs.guidance = args.guidance
+    by_default = "none" if envs.cutoff else "knots"
+    envs.guidance = by_default if args.guidance == "auto" else args.guidance
     envs.terminal_scale = min(TERMINAL_SCALE, max(std / 8, 0.001 if args.dispersion else 0.0))
     envs.flights_per_start = args.flights_per_start
     return envs.flights_per_start

@@ -52,7 +52,7 @@ RANGES = {  # lowest and highest value of every numeric flag; NaN and infinity a
     **{"eval_starts": (10, 10**6), "num_blocks": (0, 64), "memory_length": (0, 8192)},
     **{"flights_per_start": (1, 10**6), "dispersion": (0.0, 10.0), "weight_average": (0.0, 0.99999)},
 }
-CHOICES = {"action_frame": ("local", "eci"), "guidance": ("none", "linear", "knots")}
+CHOICES = {"action_frame": ("local", "eci"), "guidance": ("auto", "none", "linear", "knots")}
 CHOICES |= {"noise": ("learned", "schedule"), "lr_schedule": ("linear", "std")}
 NETWORK = ("num_blocks", "embed_dim", "num_heads", "memory_length", "mlp_dim", "hidden_dim")
 NOT_OF_A_CHECKPOINT = {"dispersion"}  # options of the environment that are chosen anew for every run and evaluation

@@ -145,6 +145,15 @@ def test_the_rockets_curriculum(std, dispersion, scale):
     assert envs.guidance == "knots" and envs.terminal_scale == pytest.approx(scale)
 
 
+@pytest.mark.parametrize("env_id, chosen", [("RocketAscent-v0", "knots"), ("RocketAscentCutoff-v0", "none")])
+def test_the_climb_is_guided_at_a_fixed_time(env_id, chosen):
+    rocket, envs = importlib.import_module("ppo_gtrxl_rocket"), gym.make_vec(env_id, num_envs=1)
+    rocket.set_curriculum(envs, rocket.Args(), 0.5, False, std=1.0)
+    assert envs.guidance == chosen
+    rocket.set_curriculum(envs, rocket.Args(guidance="linear"), 0.5, False, std=1.0)
+    assert envs.guidance == "linear"
+
+
 @pytest.fixture
 def schedules(learner, asked, monkeypatch):
     """The entropy's coefficient, lambda and the learning rate that update `iteration` of 11 uses."""

@@ -6,8 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import safetensors
 
 import envs
+import ppo_gtrxl_rocket
+import runs
 
 RESULTS = Path(__file__).parent.parent / "results"
 SHIPPED = sorted(path.parent for path in RESULTS.glob("*/eval.json"))
@@ -35,6 +38,16 @@ def test_a_result_is_whole(folder):
         else:
             error = np.linalg.norm(envs.terminal_error(arrays["y"][-1], envs.ROCKETS[metrics["env_id"]].rocket))
             assert error == pytest.approx(metrics["error_norm"], rel=1e-6)
+
+
+def test_the_bare_rocket_command_is_the_one_of_its_result():
+    args = ppo_gtrxl_rocket.Args()
+    runs.fill_last_values(args)
+    with safetensors.safe_open(RESULTS / "rocket_fixed" / "agent.safetensors", "pt") as file:
+        shipped = json.loads(file.metadata()["args"])
+    differ = {name for name, value in vars(args).items() if shipped[name] != value}
+    assert differ == {"num_threads", "eval_starts", "guidance"}
+    assert (args.guidance, shipped["guidance"]) == ("auto", "knots")  # auto: tests/test_ppo.py
 
 
 def test_results_are_below_25_megabytes():

@@ -558,7 +558,8 @@ def test_run_averages_with_its_decay(tmp_path, monkeypatch, decay):
 TABLE_1_ROCKET = """--num-blocks 6 --embed-dim 384 --num-heads 8 --memory-length 256 --mlp-dim 384 --hidden-dim 384
     --gamma 0.99 --gae-lambda 0.95 --total-updates 5000 --update-epochs 16 --vf-coef 0.8 --learning-rate 1e-4
     --learning-rate-final 5e-6 --lr-schedule linear --target-kl None --ent-coef 1e-3 --ent-coef-final 1e-4
-    --clip-coef 0.12 --flights-per-start 1 --noise learned --weight-average 0 --gae-lambda-final None"""
+    --clip-coef 0.12 --flights-per-start 1 --noise learned --weight-average 0 --gae-lambda-final None
+    --log-std -1.4 --memory-noise-final 0.1 --guidance none"""
 
 
 def test_docs_give_the_papers_rocket():
