@@ -24,6 +24,14 @@ import one_update  # noqa: E402
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+LONGEST = ["test_scripts", "test_robustness", "test_run_seeds", "test_processes", "test_fuzzing"]
+
+
+def pytest_collection_modifyitems(items):
+    """Begin with the longest files: a worker takes a file at a time, and none should wait for another's last one."""
+    items.sort(key=lambda item: [*LONGEST, item.path.stem].index(item.path.stem))
+
+
 class UnevenEnvs:
     """N environments with SAME_STEP autoreset: episodes of environment i last lengths[i] steps.
 
