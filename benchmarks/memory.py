@@ -128,7 +128,6 @@ EXPERIMENTS = {
         "Dispersed rocket, cut-off: ||error|| over 1705 flights",
         rocket_rows("rocket_dispersed"),
         DISPERSED,
-        log=True,
     ),
     "rocket_before": Experiment(
         "The same by 431bf3e to f6892e8, which saw less of what a flight differs by",
