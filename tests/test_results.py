@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import run_seeds
 import safetensors
 
 import envs
+import evaluate
 
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "results"
@@ -47,10 +49,24 @@ def test_a_policy_was_trained_by_the_command_that_its_list_gives(folder, monkeyp
     (job, *_) = [job for job in run_seeds.read_jobs("benchmarks/result_jobs.txt") if job.results.name == folder.name]
     with safetensors.safe_open(folder / "agent.safetensors", "pt") as file:
         args = json.loads(file.metadata()["args"])
-    differ = {name for name, value in job.args.items() if name in args and args[name] != value}
+    differ = {name for name, value in job.args.items() if args[name] != value}
     assert differ <= {"exp_name", "eval_starts"}  # the run's name, and what a default of none stood for
     if folder.name == "rocket_fixed":
         assert job.command == ["ppo_gtrxl_rocket.py", "--seed", "1", "--num-threads", "1"]
+
+
+def test_table_1_s_rocket_is_the_last_evaluation_of_its_curve():
+    """And its table has each evaluation's error and the sampled flights' median as it was printed then."""
+    folder = RESULTS / "rocket_paper"
+    metrics, curve = json.loads((folder / "seeds/1.json").read_text()), evaluate.read_csv(folder / "seeds/1.csv")
+    for key in set(metrics) - {"env_id", "device", "torch_version"}:  # a curve holds no words
+        assert curve[f"eval/{key}"][1][-1] == pytest.approx(float(metrics[key]), rel=1e-7), key
+    sampled = re.findall(r"update (\d+)/.* sampled error (\S+)  mean", (folder / "training.log").read_text())
+    flown = [f"{error:.3f}" for error in curve["eval/error_norm"][1]]
+    rows = re.findall(
+        r"^\| (\d+) \|.*?\|.*?\| (\S+) \| (\S+) \|", (folder / "README.md").read_text(), flags=re.MULTILINE
+    )
+    assert rows == [(update, f"{float(error):.3f}", mean) for (update, error), mean in zip(sampled, flown, strict=True)]
 
 
 def test_results_are_below_25_megabytes():
