@@ -1,4 +1,4 @@
-"""Reference optima of the problems in `envs`: Riccati, box QP, and IPOPT, each flown once more by the environments.
+"""Reference optima: Riccati, box QP, and IPOPT for the small problems; the command that solves any id's optimum.
 
     python baselines.py double-integrator --starts 1000 --seed 0
     python baselines.py van-der-pol --json van_der_pol.json --npz van_der_pol.npz
@@ -8,58 +8,46 @@
     python baselines.py TwoStageLEO-v0
     python baselines.py rocket --json results/rocket_reference.json --npz results/rocket_reference.npz
 
-Each prints mean costs over random starts and what they are compared with; a rocket has one start.
-Reading order: linear-quadratic optimum, nonlinear programs, references, command line; the rockets' optima are in
-`rocket_baselines.py`, all its names are also this module's. CasADi and SciPy are imported only where they are used:
-in a training at its start, when it solves the optimum that its evaluations fly.
+Each prints mean costs over random starts and what they are compared with; a rocket has one start. All optima are flown
+once more by the environments.
+Reading order: linear-quadratic optimum, nonlinear programs, references, the small problems' task, command line; the
+rockets' optima are in `rocket/optimum.py`. CasADi and SciPy are imported only where they are used: in a training at its
+start, when it solves the optimum that its evaluations fly.
 """
 
 from __future__ import annotations
 
-from rocket_baselines import *  # noqa: F403 - every name of it is also one of baselines.py
-
-# the star stands first: after the imports below, a type checker would lose sight of np
-# isort: split
-import argparse
 import json
 import os
 import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager, suppress
-from functools import cache
+from contextlib import suppress
+from functools import cache, lru_cache
 from multiprocessing import get_context
-from pathlib import Path
 
 import numpy as np
 
-from envs import DOUBLE_INTEGRATOR, PROBLEMS, ROCKETS, BadInput, Problem, fly, rk4
-from rocket_baselines import (
-    ASCENTS,
-    CUTOFF,
-    FIXED,
-    SEGMENTS,
-    STORED,
-    NoOptimum,
-    interruptible,
-    mission_ascent,
-    nine_pitch_angles,
-    optimise_ascent,
-    solve_ascent,
-)
+from common.command_line import OneLineParser, integer, output_file
+from common.errors import BadInput, NoOptimum
+from common.files import replacing
+from common.integration import rk4
+from common.ipopt import interruptible
+from common.tasks import add_family, env_ids, task_of
+from envs import DOUBLE_INTEGRATOR, PROBLEMS, Problem, fly
+from phased.problem import starts
+from phased.task import PhasedTask
+from rocket.optimum import rocket_reference
+from rocket.report import report_all_rockets
+
+__all__ = [  # what users import from here
+    "NoOptimum", "box_qp", "linearise", "lqr", "lqr_policy", "optimise", "reference", "riccati", "rocket_reference",
+    "starts",
+]  # fmt: skip
 
 STARTS_PER_PROCESS = 100  # fewer are solved sooner than another process has started
 REPLAY_TOLERANCE = 1e-8  # relative difference between the cost of a program's solution and of its flight
-
-
-def starts(seed: int, n: int, x0_max: float = 1.0) -> np.ndarray:
-    """The n starts (n, 2) of a seed, in evaluations and here: uniform in [-x0_max, x0_max] in each component.
-
-    `x0_max` is the problem's; 1 are the paper's "state bounds".
-    """
-    return np.random.default_rng(seed).uniform(-x0_max, x0_max, (n, 2))
-
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Linear-quadratic optimum
@@ -114,7 +102,7 @@ def lqr(problem: Problem):
     Exact for the double integrator without its bound; for Van der Pol the linearisation about the origin. Raises
     ValueError on waypoints.
     """
-    if len(problem.phases) != 1:
+    if problem.waypoints:
         raise ValueError(f"{problem.env_id} has {len(problem.phases)} phases; LQR is for problems with 1")
     K, _, P = riccati(problem)
     return K, P
@@ -237,7 +225,7 @@ def solver(env_id: str, defect: Callable, in_circles: bool):
 
 
 @cache
-def guess_laws(env_id: str) -> tuple[Callable, ...]:
+def guess_policies(env_id: str) -> tuple[Callable, ...]:
     """The feedback laws whose flights are guesses: LQR about the targets, and full control along the velocity, which
     adds most energy, wherever that LQR saturates."""
     u_max, near = PROBLEMS[env_id].u_max, lqr_policy(PROBLEMS[env_id])
@@ -253,33 +241,33 @@ def guesses(env_id: str, x0):
     """Where IPOPT begins from the start x0 (2,): yields values (3 T,) of the unknowns u_0..u_{T-1}, x_1..x_T.
 
     The first rests on the targets with no control, which is all with `Problem.single_optimum`. Otherwise three more:
-    straight lines from the start to the targets, and the flights of `guess_laws` that do not diverge. A guess is the
-    start's own, so that a solution depends neither on its neighbours nor on how the starts are shared out.
+    straight lines from the start to the targets, and the flights of `guess_policies` that do not diverge. A guess is
+    the start's own, so that a solution depends neither on its neighbours nor on how the starts are shared out.
 
     Chosen on pendulums x2' = sin x1 + u swung up with |u| <= 0.2 to 0.3, 20 starts each. Over 10 to 15 s the first
     guess ended above the best of the four at up to 5 % of the starts, with up to 1.46 of their sum of costs; over 20 s
     it failed at 85 %, the two flights at none. They take less time than the first two. Full control of either sign, no
     control, and full control against the velocity added little. The best of four can still be a local optimum.
     """
-    problem, ends = PROBLEMS[env_id], np.cumsum([0] + [phase.steps for phase in PROBLEMS[env_id].phases])
+    problem, ends = PROBLEMS[env_id], np.append(0, PROBLEMS[env_id].phase_ends)
     T, corners = problem.steps, np.array([x0, *(phase.target for phase in problem.phases)])
     yield np.append(np.zeros(T), targets(problem))
     if problem.single_optimum:
         return
     line = np.column_stack([np.interp(np.arange(1, T + 1), ends, corner) for corner in corners.T])
     yield np.append(np.zeros(T), line)
-    for law in guess_laws(env_id):
+    for policy in guess_policies(env_id):
         with suppress(BadInput), np.errstate(all="ignore"):  # a state that overflows gives an action that is refused
-            flight = fly(env_id, law, x0[None])
+            flight = fly(env_id, policy, x0[None])
             guess = np.append(flight["u"], flight["x"][0, 1:])
             if np.isfinite(guess).all():
                 yield guess
 
 
 @interruptible()
-def _solve_start(task):
-    """Solve one start, as `optimise` returns it. A task holds all it needs, so that any process can take it."""
-    env_id, defect, in_circles, index, x0 = task
+def _solve_start(job):
+    """Solve one start, as `optimise` returns it. A job holds all it needs, so that any process can take it."""
+    env_id, defect, in_circles, index, x0 = job
     solve, arguments = solver(env_id, defect, in_circles)
     T = PROBLEMS[env_id].steps
     solutions, statuses = [], []
@@ -309,13 +297,13 @@ def optimise(env_id: str, x0, defect: Callable = shooting, in_circles: bool = Fa
     """
     if processes is None:
         processes = max(1, min(os.cpu_count() or 1, len(x0) // STARTS_PER_PROCESS))
-    tasks = [(env_id, defect, in_circles, index, start) for index, start in enumerate(x0)]
+    jobs = [(env_id, defect, in_circles, index, start) for index, start in enumerate(x0)]
     if processes == 1:
-        solutions = [_solve_start(task) for task in tasks]
+        solutions = [_solve_start(job) for job in jobs]
     else:
-        chunk = -(-len(tasks) // (4 * processes))
+        chunk = -(-len(jobs) // (4 * processes))
         with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
-            solutions = list(pool.map(_solve_start, tasks, chunksize=chunk))
+            solutions = list(pool.map(_solve_start, jobs, chunksize=chunk))
     u, cost, feasible, multipliers = zip(*solutions)
     return np.array(u), np.array(cost), np.array(feasible), np.array(multipliers)
 
@@ -325,7 +313,7 @@ def optimise(env_id: str, x0, defect: Callable = shooting, in_circles: bool = Fa
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def replay(env_id: str, x0, u, cost):
+def fly_solution(env_id: str, x0, u, cost):
     """Fly the controls u (n, T) from x0 (n, 2): what `envs.fly` returns, and `replay_error` (n,).
 
     That is the relative difference between the program's `cost` (n,) and the flight's. Raises RuntimeError, naming the
@@ -359,25 +347,25 @@ def reference(env_id: str, x0, processes: int | None = None) -> dict:
         raise ValueError(f"processes is {processes}; it must be at least 1")
     if env_id == DOUBLE_INTEGRATOR.env_id:
         return fly(env_id, lqr_policy(DOUBLE_INTEGRATOR), x0)
-    if len(PROBLEMS[env_id].phases) == 1:
+    if not PROBLEMS[env_id].waypoints:
         u, cost, _, _ = optimise(env_id, x0, processes=processes)
-        return replay(env_id, x0, u, cost)
+        return fly_solution(env_id, x0, u, cost)
     return waypoint_reference(env_id, x0, processes)
 
 
 def waypoint_reference(env_id: str, x0, processes: int | None = None) -> dict:
     """The better, bonuses counted, of the optima with and without |x - target| <= r at every phase's end.
 
-    Beside `replay`'s arrays: `constrained` (n,), whether it is the one with the circles; `infeasible` (n,), whether no
-    control reaches all circles (then it is the one without); `cost_free` (n,), `terminal_error_free` (n, phases) of the
-    optimum without; and `circle_price` (n, phases), what a unit of radius would save the one with the circles: from
-    their multipliers, 0 where it ends inside, NaN where infeasible. Raises RuntimeError where an optimum with the
-    circles misses one in flight.
+    Beside `fly_solution`'s arrays: `constrained` (n,), whether it is the one with the circles; `infeasible` (n,),
+    whether no control reaches all circles (then it is the one without); `cost_free` (n,), `terminal_error_free`
+    (n, phases) of the optimum without; `circle_price` (n, phases), what a unit of radius would save the one with the
+    circles: from their multipliers, 0 where it ends inside, NaN where infeasible. Raises RuntimeError where an optimum
+    with the circles misses one in flight.
     """
     u_free, cost_free, _, _ = optimise(env_id, x0, processes=processes)
     u, cost, feasible, multipliers = optimise(env_id, x0, in_circles=True, processes=processes)
-    free = replay(env_id, x0, u_free, cost_free)
-    circled = replay(env_id, x0, np.where(feasible[:, None], u, u_free), np.where(feasible, cost, cost_free))
+    free = fly_solution(env_id, x0, u_free, cost_free)
+    circled = fly_solution(env_id, x0, np.where(feasible[:, None], u, u_free), np.where(feasible, cost, cost_free))
     missed = feasible & ~circled["hit"].all(axis=1)
     if missed.any():
         start = int(np.argmax(missed))
@@ -394,7 +382,7 @@ def waypoint_reference(env_id: str, x0, processes: int | None = None) -> dict:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Command line
+# What a reference is compared with
 # ---------------------------------------------------------------------------------------------------------------------
 
 
@@ -454,6 +442,55 @@ def compare_waypoints(env_id: str, x0, flight: dict) -> dict:
     return numbers
 
 
+def compare(env_id: str, x0, flight: dict) -> dict:
+    """What the reference `flight` from x0 (n, 2) is compared with, by the kind of problem."""
+    if env_id == DOUBLE_INTEGRATOR.env_id:
+        return compare_double_integrator(env_id, x0, flight)
+    kind = compare_single_phase if not PROBLEMS[env_id].waypoints else compare_waypoints
+    return kind(env_id, x0, flight)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The small problems' task
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+@lru_cache(maxsize=4)
+def kept_reference(problem: Problem, eval_seed: int, n: int) -> dict:
+    """`reference` from the n starts of a seed: evaluations during a training fly the same starts again and again."""
+    return reference(problem.env_id, starts(eval_seed, n, problem.x0_max))
+
+
+class SmallProblemTask(PhasedTask):
+    """What is asked of a small problem's id: its optimum here, all else in `phased/task.py`."""
+
+    def optimum(self, eval_seed: int, n: int, **env_options) -> dict:
+        return kept_reference(self.problem, eval_seed, n)
+
+    def add_arguments(self, parser) -> None:
+        parser.add_argument("--starts", type=integer(1, 100_000), default=1000, metavar="N", help="default 1000")
+        parser.add_argument("--seed", type=integer(0, 2**32 - 1), default=0, metavar="S", help="default 0")
+
+    def baseline_command(self, args) -> tuple[dict, dict]:
+        x0 = starts(args.seed, args.starts, self.problem.x0_max)
+        begin = time.perf_counter()
+        flight = reference(self.env_id, x0)
+        seconds = time.perf_counter() - begin
+        numbers = {"env_id": self.env_id, "starts": args.starts, "seed": args.seed, "solve_seconds": seconds}
+        numbers |= summarise(flight) | compare(self.env_id, x0, flight)
+        for key, value in numbers.items():
+            print(f"{key:<32}{value if isinstance(value, str) else format(value, '.7g')}")
+        arrays = {f"{key}_reference": flight[key] for key in ("x", "u", "cost")}
+        return numbers, {"t": self.problem.dt * np.arange(flight["x"].shape[1]), **arrays}
+
+
+add_family(PROBLEMS, lambda env_id: SmallProblemTask(PROBLEMS[env_id]))
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Command line
+# ---------------------------------------------------------------------------------------------------------------------
+
 SHORT_NAMES = {  # of sub-commands; every problem has its id, too
     "DoubleIntegrator-v0": "double-integrator",
     "VanDerPol-v0": "van-der-pol",
@@ -462,81 +499,8 @@ SHORT_NAMES = {  # of sub-commands; every problem has its id, too
 }
 
 
-def compare(env_id: str, x0, flight: dict) -> dict:
-    """What the reference `flight` from x0 (n, 2) is compared with, by the kind of problem."""
-    if env_id == DOUBLE_INTEGRATOR.env_id:
-        return compare_double_integrator(env_id, x0, flight)
-    kind = compare_single_phase if len(PROBLEMS[env_id].phases) == 1 else compare_waypoints
-    return kind(env_id, x0, flight)
-
-
-def report(args) -> None:
-    """Solve, print the table, and write the files asked for: the numbers as JSON, the trajectories as npz."""
-    env_id = args.env_id
-    x0 = starts(args.seed, args.starts, PROBLEMS[env_id].x0_max)
-    begin = time.perf_counter()
-    flight = reference(env_id, x0)
-    numbers = {"env_id": env_id, "starts": args.starts, "seed": args.seed, "solve_seconds": time.perf_counter() - begin}
-    numbers |= summarise(flight) | compare(env_id, x0, flight)
-    for key, value in numbers.items():
-        print(f"{key:<32}{value if isinstance(value, str) else format(value, '.7g')}")
-    arrays = {f"{key}_reference": flight[key] for key in ("x", "u", "cost")}
-    save(args, numbers, {"t": PROBLEMS[env_id].dt * np.arange(flight["x"].shape[1]), **arrays})
-
-
-def pontryagin_angle(optimum: dict):
-    """Angles (m,), degrees, between the thrust and the costate of the velocity, which the maximum principle wants 0."""
-    u, costate = optimum["u"], optimum["costate"]
-    return np.degrees(np.arctan2(np.linalg.norm(np.cross(u, costate), axis=1), (u * costate).sum(axis=1)))
-
-
-def check_rocket(numbers: dict, optimum: dict) -> dict:
-    """Checks of `free`, by its collocation `optimum`: the maximum principle, the mass that drag costs, other meshes."""
-    mass, angle = numbers["free"]["final_mass_kg"], pontryagin_angle(optimum)
-    checks = {"costate_angle_deg_max": angle.max(), "costate_angle_deg_median": np.median(angle)}
-    checks["drag_free_mass_gain_kg"] = numbers["drag_free"]["final_mass_kg"] - mass
-    for segments in (SEGMENTS // 2, 2 * SEGMENTS):
-        checks[f"mass_change_kg_{segments}_segments"] = optimise_ascent(ASCENTS["free"], segments)["final_mass"] - mass
-    return {key: float(value) for key, value in checks.items()}
-
-
-def report_rocket(args) -> None:
-    """Solve `ASCENTS` and the other missions', or one's: print rows, checks, opponents; write the files asked for."""
-    columns = ("final_mass_kg", "final_time_s", "error_norm", "replay_error_norm", "max_altitude_km", "solve_seconds")
-    print(f"{'':<16}" + "".join(f"{name:>19}" for name in columns) + "  status")
-    cases = {key: mission_ascent(key, mission) for key, mission in ROCKETS.items() if key not in STORED}
-    cases = ASCENTS | cases
-    if args.env_id:
-        cases = {args.env_id: mission_ascent(args.env_id, ROCKETS[args.env_id])}
-    numbers, flights, optima = {}, {}, {}
-    for key, case in cases.items():
-        numbers[key], flights[key], optima[key] = solve_ascent(case)
-        cells = "".join(f"{numbers[key][name]:>19.10g}" for name in columns)
-        print(f"{key:<16}{cells}  {numbers[key]['status']}", flush=True)
-    if not args.env_id:
-        numbers["checks"] = check_rocket(numbers, optima["free"])
-        for name, value in numbers["checks"].items():
-            print(f"{name:<32}{value:.7g}")
-    numbers |= opponents(flights)
-    arrays = {f"{key}_{name}": flight[name] for key, flight in flights.items() for name in ("t", "u")}
-    save(args, numbers, arrays)
-
-
-def opponents(flights: dict) -> dict:
-    """`nine_pitch_angles` of every mission whose optimum is among the flights, printed; its numbers by a name each."""
-    names, numbers = {CUTOFF: "nine_pitch_angles", FIXED: "nine_pitch_angles_fixed"}, {}
-    for env_id, mission in ROCKETS.items():
-        key, name = STORED.get(env_id, env_id), names.get(env_id, f"nine_pitch_angles_{env_id}")
-        flight = flights.get(env_id, flights.get(key))
-        if flight is not None:
-            opponent = nine_pitch_angles(env_id, flight, mission.rocket)
-            numbers[name] = {part: float(opponent[part]) for part in ("error_norm", "final_mass_kg", "final_time_s")}
-            print(f"{name:<40}" + "  ".join(f"{part} {value:.7g}" for part, value in numbers[name].items()))
-    return numbers
-
-
 def save(args, numbers: dict, arrays: dict) -> None:
-    """Write the files asked for."""
+    """Write the files asked for: the numbers as JSON, the trajectories as npz."""
     if args.json:
         with replacing(args.json, "w") as file:
             json.dump(numbers, file, indent=2)
@@ -545,65 +509,20 @@ def save(args, numbers: dict, arrays: dict) -> None:
             np.savez_compressed(file, **arrays)
 
 
-@contextmanager
-def replacing(path, mode: str = "wb"):
-    """Open a temporary file that becomes `path` when the block ends without an error: whole or untouched."""
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with open(temporary, mode, newline=None if "b" in mode else "") as file:
-            yield file
-        os.replace(temporary, path)
-    except OSError as error:
-        if error.errno and not error.filename:  # a full disk does not say which file
-            error.filename = str(path)
-        raise
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-class OneLineParser(argparse.ArgumentParser):
-    """Errors are one line, without the usage above it."""
-
-    def error(self, message):
-        sys.exit(f"error: {message}")
-
-
-def integer(low: int, high: int) -> Callable:
-    """Argument type: a whole number from `low` to `high`."""
-
-    def parse(text):
-        if not text.isdecimal() or not low <= int(text) <= high:
-            raise argparse.ArgumentTypeError(f"{text!r} must be a whole number from {low} to {high}")
-        return int(text)
-
-    return parse
-
-
-def output(text: str) -> Path:
-    """Argument type: a file to write, refused before anything is solved if that cannot work."""
-    path = Path(text)
-    if path.is_dir() or not os.access(path.parent, os.W_OK):
-        raise argparse.ArgumentTypeError(f"{text!r} must be a file in an existing, writable folder")
-    return path
-
-
 def parse_args(argv=None):
-    """One sub-command per problem; each sets `run`, the function that the main part calls with the arguments."""
+    """One sub-command for each id, and `rocket`; each sets `solve`, which the main part calls with the arguments."""
     parser = OneLineParser(description=str(__doc__).splitlines()[0])
     commands = parser.add_subparsers(dest="command", required=True)
-    for env_id in PROBLEMS:
+    for env_id in env_ids():
         names = [SHORT_NAMES[env_id]] if env_id in SHORT_NAMES else []
-        command = commands.add_parser(env_id, aliases=names, help="optima of this problem")
-        command.add_argument("--starts", type=integer(1, 100_000), default=1000, metavar="N", help="default 1000")
-        command.add_argument("--seed", type=integer(0, 2**32 - 1), default=0, metavar="S", help="default 0")
-        command.set_defaults(run=report, env_id=env_id)
-    for env_id in (None, *ROCKETS):
-        command = commands.add_parser(env_id or "rocket", help="optimum of this rocket" if env_id else "of all rockets")
-        command.set_defaults(run=report_rocket, env_id=env_id)
+        command = commands.add_parser(env_id, aliases=names, help="its optima")
+        task_of(env_id).add_arguments(command)
+        command.set_defaults(solve=task_of(env_id).baseline_command)
+    command = commands.add_parser("rocket", help="the optima of all rockets")
+    command.set_defaults(solve=lambda args: report_all_rockets())
     for command in set(commands.choices.values()):  # a problem with two names is there twice
-        command.add_argument("--json", type=output, metavar="F", help="write the numbers to this file")
-        command.add_argument("--npz", type=output, metavar="F", help="write the trajectories to this file")
+        command.add_argument("--json", type=output_file, metavar="F", help="write the numbers to this file")
+        command.add_argument("--npz", type=output_file, metavar="F", help="write the trajectories to this file")
     return parser.parse_args(argv)
 
 
@@ -611,7 +530,7 @@ def main() -> None:
     """Run the sub-command; what can go wrong in it ends in one line."""
     args = parse_args()
     try:
-        args.run(args)
+        save(args, *args.solve(args))
     except (ImportError, OSError, RuntimeError) as error:
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:

@@ -22,7 +22,7 @@ from torch.distributions import Normal
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 import runs
-from runs import total
+from runs import all_reduce_sum
 
 
 @dataclass
@@ -110,7 +110,7 @@ def mean_action(output, action_scale):
     return output * action_scale
 
 
-def learn_buffers(agent, averaged, args, batch):
+def update_running_statistics(agent, averaged, args, batch):
     """Nothing: no constant of these problems is learnt from flights."""
 
 
@@ -359,7 +359,7 @@ def rollout(agent, envs, reward_scale, memory_noise):
         if not alive.any():
             break
     batch.logprobs, _, batch.values = agent.evaluate_actions(hidden, batch.actions)  # v_t of line 8
-    everyone = runs.gathered(episodes)
+    everyone = runs.all_gather(episodes)
     return batch, {key: np.concatenate([part[key] for part in everyone]) for key in episodes}
 
 
@@ -377,9 +377,9 @@ def gae(rewards, values, alive, gamma, gae_lambda):
 
 def moments(x, alive, dim):
     """Mean and variance along dim of the living steps of every process."""
-    count = total(alive.sum(dim, keepdim=True)).clamp(min=1)
-    mean = total((x * alive).sum(dim, keepdim=True)) / count
-    variance = total(((x - mean) ** 2 * alive).sum(dim, keepdim=True)) / count
+    count = all_reduce_sum(alive.sum(dim, keepdim=True)).clamp(min=1)
+    mean = all_reduce_sum((x * alive).sum(dim, keepdim=True)) / count
+    variance = all_reduce_sum(((x - mean) ** 2 * alive).sum(dim, keepdim=True)) / count
     return mean, variance
 
 
@@ -431,7 +431,7 @@ def ppo_loss(agent, batch, mb, clip_coef, vf_coef, ent_coef):
     process's part of the mean (the gradients are then summed), what is logged is of all.
     """
     alive, advantages = batch.alive[:, mb], batch.advantages[:, mb]
-    steps = total(alive.sum())
+    steps = all_reduce_sum(alive.sum())
     mean = lambda x: (x * alive).sum() / steps  # noqa: E731
     hidden = agent.encode(batch.obs[:, mb].transpose(0, 1), batch.memory[:, mb]).transpose(0, 1)  # line 17
     newlogprob, entropy, newvalue = agent.evaluate_actions(hidden, batch.actions[:, mb])
@@ -446,7 +446,7 @@ def ppo_loss(agent, batch, mb, clip_coef, vf_coef, ent_coef):
     with torch.no_grad():  # http://joschu.net/blog/kl-approx.html
         losses |= {"old_approx_kl": mean(-logratio), "approx_kl": mean((ratio - 1) - logratio)}
         losses["clipfrac"] = mean(((ratio - 1.0).abs() > clip_coef).to(ratio.dtype))
-    return loss, dict(zip(losses, total(torch.stack([value.detach() for value in losses.values()]))))
+    return loss, dict(zip(losses, all_reduce_sum(torch.stack([value.detach() for value in losses.values()]))))
 
 
 # Shared: training (Algorithm 1) and main ------------------------------------------------------------------------------
@@ -522,7 +522,7 @@ def train(args, agent, average, optimizer, envs, run):
         means["explained_variance"] = explained_variance(batch.values, batch.returns, batch.alive)
         means["baseline_explained_variance"] = explained_variance(baseline, returns, batch.alive)
 
-        learn_buffers(agent, average.module, args, batch)
+        update_running_statistics(agent, average.module, args, batch)
 
         # the noise of the next update: linear to its last value, from wherever it is
         if args.noise == "schedule" or refines:

@@ -22,8 +22,10 @@ from torch.distributions import Normal
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 import runs
-from envs import DIFFERENCES, ROCKETS, TERMINAL_SCALE, mass_rewards, policy_constants
-from runs import total
+from envs import ROCKETS
+from rocket.observation import DIFFERENCES, policy_constants
+from rocket.rewards import TERMINAL_SCALE, mass_rewards
+from runs import all_reduce_sum
 
 
 @dataclass
@@ -135,7 +137,7 @@ def features(agent, obs):
 
 
 @torch.no_grad()
-def learn_buffers(agent, averaged, args, batch):
+def update_running_statistics(agent, averaged, args, batch):
     """Move `mean_flight` to the mean of an update's dispersed flights: at first all the way, then by a tenth."""
     if (args.dispersion or args.observe_draw) and not agent.mean_flight.any():
         new_inputs = len(DIFFERENCES) + batch.obs.shape[-1] - 9  # and the draw, all zeros on nominal flights
@@ -162,7 +164,7 @@ def shape_rewards(envs, args, progress, batch, episodes):
     if weight:
         group_size = args.flights_per_start if args.dispersion else len(episodes["error"])
         paid = weight * mass_rewards(episodes, envs.rocket, envs.terminal_scale, group_size)
-        mine = torch.as_tensor(runs.own_part(paid, envs.num_envs) * args.reward_scale).to(batch.rewards)
+        mine = torch.as_tensor(runs.local_shard(paid, envs.num_envs) * args.reward_scale).to(batch.rewards)
         batch.rewards[batch.alive.sum(0).long() - 1, torch.arange(envs.num_envs)] += mine
 
 
@@ -405,7 +407,7 @@ def rollout(agent, envs, reward_scale, memory_noise):
         if not alive.any():
             break
     batch.logprobs, _, batch.values = agent.evaluate_actions(hidden, batch.actions)  # v_t of line 8
-    everyone = runs.gathered(episodes)
+    everyone = runs.all_gather(episodes)
     return batch, {key: np.concatenate([part[key] for part in everyone]) for key in episodes}
 
 
@@ -423,9 +425,9 @@ def gae(rewards, values, alive, gamma, gae_lambda):
 
 def moments(x, alive, dim):
     """Mean and variance along dim of the living steps of every process."""
-    count = total(alive.sum(dim, keepdim=True)).clamp(min=1)
-    mean = total((x * alive).sum(dim, keepdim=True)) / count
-    variance = total(((x - mean) ** 2 * alive).sum(dim, keepdim=True)) / count
+    count = all_reduce_sum(alive.sum(dim, keepdim=True)).clamp(min=1)
+    mean = all_reduce_sum((x * alive).sum(dim, keepdim=True)) / count
+    variance = all_reduce_sum(((x - mean) ** 2 * alive).sum(dim, keepdim=True)) / count
     return mean, variance
 
 
@@ -477,7 +479,7 @@ def ppo_loss(agent, batch, mb, clip_coef, vf_coef, ent_coef):
     process's part of the mean (the gradients are then summed), what is logged is of all.
     """
     alive, advantages = batch.alive[:, mb], batch.advantages[:, mb]
-    steps = total(alive.sum())
+    steps = all_reduce_sum(alive.sum())
     mean = lambda x: (x * alive).sum() / steps  # noqa: E731
     hidden = agent.encode(batch.obs[:, mb].transpose(0, 1), batch.memory[:, mb]).transpose(0, 1)  # line 17
     newlogprob, entropy, newvalue = agent.evaluate_actions(hidden, batch.actions[:, mb])
@@ -492,7 +494,7 @@ def ppo_loss(agent, batch, mb, clip_coef, vf_coef, ent_coef):
     with torch.no_grad():  # http://joschu.net/blog/kl-approx.html
         losses |= {"old_approx_kl": mean(-logratio), "approx_kl": mean((ratio - 1) - logratio)}
         losses["clipfrac"] = mean(((ratio - 1.0).abs() > clip_coef).to(ratio.dtype))
-    return loss, dict(zip(losses, total(torch.stack([value.detach() for value in losses.values()]))))
+    return loss, dict(zip(losses, all_reduce_sum(torch.stack([value.detach() for value in losses.values()]))))
 
 
 # Shared: training (Algorithm 1) and main ------------------------------------------------------------------------------
@@ -568,7 +570,7 @@ def train(args, agent, average, optimizer, envs, run):
         means["explained_variance"] = explained_variance(batch.values, batch.returns, batch.alive)
         means["baseline_explained_variance"] = explained_variance(baseline, returns, batch.alive)
 
-        learn_buffers(agent, average.module, args, batch)
+        update_running_statistics(agent, average.module, args, batch)
 
         # the noise of the next update: linear to its last value, from wherever it is
         if args.noise == "schedule" or refines:

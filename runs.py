@@ -30,8 +30,12 @@ import torch.distributed as dist
 import tyro
 
 import evaluate
-from baselines import NoOptimum
-from envs import PROBLEMS
+from common import files
+from common.checkpoints import COUNTERS, read_checkpoint
+from common.curves import read_curve
+from common.errors import BadInput, NoOptimum
+from common.evaluations import write_evaluation
+from common.tasks import Task, task_of
 
 gc.freeze()  # what was imported is never garbage; looking through it took a fifth of the time of --help
 
@@ -111,19 +115,27 @@ def parse_args(kind, argv, env_options, buffers):
         saved = load_state(args.resume, kind, env_ids)
         args = kind(**{**saved["args"], **{name: getattr(args, name) for name in typed}})
     elif args.checkpoint is not None:
-        saved = read_checkpoint(args, kind, typed, env_options, buffers)
+        saved = take_checkpoint_args(args, kind, typed, env_options, buffers)
     elif args.eval_only:
         refuse("checkpoint", None, "must name the agent.safetensors that --eval-only flies")
     check(args, typed, env_ids)
     check_buffers(args, buffers[args.env_id])
-    if args.eval_only and saved and saved["progress"]["seed"] == args.eval_seed and args.env_id in PROBLEMS:
-        print(f"--eval-seed {args.eval_seed} is the training's --seed: it may have flown these starts")
+    task = task_of(args.env_id)
+    if unfit := task.refusal(not args.eval_only, **options_of(args, env_options)):
+        name, why = unfit
+        refuse(name, "", why)
+    if args.eval_only and saved and saved["progress"]["seed"] == args.eval_seed:
+        if remark := task.remark_on_seed(args.eval_seed):
+            print(remark)
     fill_last_values(args)
     if args.eval_starts is None:
-        args.eval_starts = 1000 if args.eval_only else 50
-        if getattr(args, "dispersion", 0.0):
-            args.eval_starts = evaluate.DISPERSED_STARTS
+        args.eval_starts = task.default_flights(not args.eval_only, **options_of(args, env_options))
     return args, saved
+
+
+def options_of(args, env_options):
+    """The keywords of the environments, from the arguments of these names."""
+    return {name: getattr(args, name) for name in env_options}
 
 
 def fill_last_values(args):
@@ -133,7 +145,7 @@ def fill_last_values(args):
             setattr(args, f"{name}_final", getattr(args, name))
 
 
-def read_checkpoint(args, kind, typed, env_options, buffers):
+def take_checkpoint_args(args, kind, typed, env_options, buffers):
     """What the file --checkpoint holds; sets the arguments that it decides, and refuses flags that contradict it.
 
     Its environment may be another with the same buffers, and its noise is gone on with, unless a flag says otherwise.
@@ -141,7 +153,7 @@ def read_checkpoint(args, kind, typed, env_options, buffers):
     options = [name for name in env_options if name not in NOT_OF_A_CHECKPOINT]
     decided = {name: type(getattr(kind, name)) for name in ("env_id", *options, *NETWORK)}
     defaults = {name: getattr(kind, name) for name in options}  # of options that are younger than the file
-    saved = evaluate.read_checkpoint(args.checkpoint, decided, tuple(buffers), defaults)
+    saved = read_checkpoint(args.checkpoint, decided, tuple(buffers), defaults)
     for name in decided:
         value, given = saved["args"][name], getattr(args, name)
         if name == "env_id" and name in typed and value != given and buffers.get(value) == buffers.get(given):
@@ -172,8 +184,6 @@ def check(args, typed, env_ids):
     check_outputs(args)
     if Path(args.exp_name).name != args.exp_name:
         refuse("exp_name", args.exp_name, "must be the name of a folder, without /")
-    if getattr(args, "dispersion", 0.0) and not (args.observe_phase or args.eval_only):
-        refuse("no_observe_phase", "", "not in a training with --dispersion: the mean flight is found by the time")
     if args.track and importlib.util.find_spec("wandb") is None:
         refuse("track", "", "needs wandb: pip install wandb")
     check_share(args, typed)
@@ -223,22 +233,26 @@ def check_share(args, typed):
     processes = int(os.environ.get("WORLD_SIZE", 1))
     if args.num_envs < processes:
         refuse("num_envs", args.num_envs, f"must be at least the number of processes, {processes}")
-    share = args.num_envs // processes
-    shares = {share, -(-args.num_envs // processes)}  # the first processes fly one more where it does not divide
-    whose = f"--num-envs {args.num_envs}" + (f" / {processes} processes" if processes > 1 else "")
-    minibatches, group = args.num_minibatches, args.flights_per_start
-    if minibatches > share:
+    smallest, largest = args.num_envs // processes, -(-args.num_envs // processes)  # the first processes fly one more
+    total_envs = f"--num-envs {args.num_envs}" + (f" / {processes} processes" if processes > 1 else "")
+
+    if args.num_minibatches > smallest:
         if "num_minibatches" in typed:
-            refuse("num_minibatches", minibatches, f"must be at most {whose}")
-        print(f"--num-minibatches lowered from {minibatches} to {whose}")
-        args.num_minibatches = share
-    if any(flights % group for flights in shares):
+            refuse("num_minibatches", args.num_minibatches, f"must be at most {total_envs}")
+        print(f"--num-minibatches lowered from {args.num_minibatches} to {total_envs}")
+        args.num_minibatches = smallest
+
+    group = largest_group(args.flights_per_start, {smallest, largest})
+    if group < args.flights_per_start:
         if "flights_per_start" in typed:
-            refuse("flights_per_start", group, f"must divide {whose}")
-        while any(flights % group for flights in shares):
-            group -= 1
-        print(f"--flights-per-start lowered from {args.flights_per_start} to {group}, which divides {whose}")
+            refuse("flights_per_start", args.flights_per_start, f"must divide {total_envs}")
+        print(f"--flights-per-start lowered from {args.flights_per_start} to {group}, which divides {total_envs}")
         args.flights_per_start = group
+
+
+def largest_group(most, shares):
+    """The largest group of at most `most` flights that divides every process's share of the environments."""
+    return next(group for group in range(most, 0, -1) if all(share % group == 0 for share in shares))
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -258,7 +272,7 @@ def start(main):
         signal.signal(signum, interrupt)
     try:
         main(sys.argv[1:])
-    except (evaluate.BadInput, NoOptimum, ImportError, OSError) as error:
+    except (BadInput, NoOptimum, ImportError, OSError) as error:
         fail(error)
     except KeyboardInterrupt:
         sys.exit(status[0])
@@ -279,7 +293,7 @@ def make_envs(args, env_options):
 
     An evaluation draws its starts as a reset does: its seed would train on them, so another takes its place.
     """
-    rank, processes = process()
+    rank, processes = rank_and_world_size()
     share = args.num_envs // processes + (rank < args.num_envs % processes)
     envs = gym.make_vec(args.env_id, num_envs=share, **env_options)
     seed = args.seed + 2**31 * rank
@@ -324,7 +338,6 @@ def refuse_nan(values, epoch, minibatch):
 # ---------------------------------------------------------------------------------------------------------------------
 
 SAVE_EVERY = 10  # updates
-TRAINING_DISPERSED_STARTS = 100
 TRAINING_EVAL_SEED = 2**31  # beyond --eval-seed: no reported start is flown during training
 
 
@@ -339,7 +352,8 @@ class Run:
     def __init__(self, args, saved, agent, average, optimizer, envs, env_options, describe):
         self.args, self.envs, self.env_options, self.describe = args, envs, env_options, describe
         self.modules = {"agent": agent, "average": average, "optimizer": optimizer}
-        self.rank, _ = process()
+        self.rank, _ = rank_and_world_size()
+        self.task: Task = task_of(args.env_id)
         self.folder: Any = None  # a Path; it and TensorBoard's writer are of the first process, from `with run:` on
         self.writer: Any = None
         self.metrics = {}
@@ -371,7 +385,7 @@ class Run:
             leftover.unlink()
         arguments = {**asdict(self.args), "resume": None}
         if self.args.save_model:
-            evaluate.write_json(self.folder / "args.json", arguments)
+            files.write_json(self.folder / "args.json", arguments)
         if self.args.track:
             track(self.args, self.folder.name)
         self.writer = new_writer(self.folder, self.progress["global_step"] + 1, arguments)
@@ -381,8 +395,9 @@ class Run:
 
     def solve_reference(self):
         """The optima that evaluations fly, before anything is learned: one that does not exist is said at once."""
-        for seed in [TRAINING_EVAL_SEED] * (self.args.eval_every > 0) + [self.args.eval_seed]:
-            evaluate.optimum(self.args.env_id, seed, self.args.eval_starts)
+        seeds = [TRAINING_EVAL_SEED] * (self.args.eval_every > 0) + [self.args.eval_seed]
+        for seed in seeds:
+            self.task.optimum(seed, self.flights(seed), **self.env_options)
 
     def __exit__(self, kind, error, traceback):
         if self.writer:
@@ -414,7 +429,7 @@ class Run:
         alive (T, N) is the batch's, episodes the `final_info` of all, losses the means over the update.
         """
         args, now = self.args, time.time()
-        steps = int(total(alive.sum()))
+        steps = int(all_reduce_sum(alive.sum()))
         self.progress = {**self.progress, "total_updates": iteration, "wall_seconds": now - self.began}
         self.progress["global_step"] += steps
         self.progress["training_seconds"] += now - self.update_began
@@ -450,14 +465,17 @@ class Run:
 
     def evaluate(self, eval_seed):
         """Fly the mean action of the averaged weights and the optimum: eval.json's metrics and eval.npz's arrays."""
-        args, average = self.args, self.modules["average"].module
+        average = self.modules["average"].module
         policy = average.make_policy(self.envs.episode_steps)
-        starts = args.eval_starts
-        if eval_seed == TRAINING_EVAL_SEED and getattr(args, "dispersion", 0.0):
-            starts = min(starts, TRAINING_DISPERSED_STARTS)
-        metrics, arrays = evaluate.evaluate(args.env_id, policy, eval_seed, starts, **self.env_options)
+        metrics, arrays = self.task.evaluate(policy, eval_seed, self.flights(eval_seed), **self.env_options)
         device = average.actor_logstd.device.type
         return {**metrics, **self.progress, "device": device, "torch_version": torch.__version__}, arrays
+
+    def flights(self, eval_seed):
+        """How many flights the evaluation of a seed has."""
+        if eval_seed == TRAINING_EVAL_SEED:
+            return self.task.interim_flights(self.args.eval_starts, **self.env_options)
+        return self.args.eval_starts
 
     def finish(self):
         """Fly the reported starts; write the evaluation where it was asked for, print the table."""
@@ -465,26 +483,21 @@ class Run:
         if self.rank > 0:
             return
         metrics, arrays = self.evaluate(args.eval_seed)
-        metrics |= evaluate.mass_reached(metrics)
+        timed_policy = self.modules["average"].module.make_policy(self.envs.episode_steps) if args.eval_only else None
+        metrics |= self.task.reported_metrics(metrics, timed_policy, **self.env_options)
         if args.eval_only:
-            if "dispersion" in metrics:
-                policy = self.modules["average"].module.make_policy(self.envs.episode_steps)
-                metrics["decision_us"] = evaluate.decision_us(args.env_id, policy, **self.env_options)
-            evaluate.write(metrics, arrays, args.checkpoint, args.eval_json, args.eval_npz)
-            print(evaluate.table(metrics))
+            write_evaluation(metrics, arrays, args.checkpoint, args.eval_json, args.eval_npz)
+            print(self.task.table(metrics))
             return
         self.log("eval", metrics)
         self.writer.close()
         if args.save_model:
             paths = (self.folder / name for name in ("agent.safetensors", "eval.json", "eval.npz"))
-            evaluate.write(metrics, arrays, *paths)
+            write_evaluation(metrics, arrays, *paths)
         if args.capture_video:
-            import animation
-            import figures
-
-            figures.draw(self.folder / "figures", arrays, metrics, evaluate.read_curve(self.folder))
-            animation.write(self.folder / "figures", arrays, metrics)
-        print(evaluate.table(metrics))
+            evaluate.draw_figures(self.folder, arrays, metrics, [read_curve(self.folder)])
+            evaluate.draw_animation(self.folder, arrays, metrics)
+        print(self.task.table(metrics))
         print(f"run folder: {self.folder}")
 
 
@@ -528,7 +541,7 @@ def training_state(args, modules, envs, progress):
     """All that a bit-exact resume needs, copied, so that training can go on while it is kept."""
     modules = {name: module.state_dict() for name, module in modules.items()}
     rng = {"torch": torch.get_rng_state(), "envs": json.dumps(envs.np_random.bit_generator.state)}
-    rng = gathered({**rng, "cuda": torch.cuda.get_rng_state_all()})
+    rng = all_gather({**rng, "cuda": torch.cuda.get_rng_state_all()})
     return copy.deepcopy({"args": {**asdict(args), "resume": None}, "progress": progress, "rng": rng, **modules})
 
 
@@ -541,14 +554,13 @@ def restore(state, run_dir, modules, envs):
                 raise ValueError(f"{name} is not that of {state['args']['env_id']} now")
         for name, module in modules.items():
             module.load_state_dict(state[name])
-        if len(state["rng"]) != process()[1]:
+        if len(state["rng"]) != rank_and_world_size()[1]:
             raise ValueError(f"it was trained by {len(state['rng'])} processes")
-        rng = state["rng"][process()[0]]
+        rng = state["rng"][rank_and_world_size()[0]]
         torch.set_rng_state(rng["torch"])
         torch.cuda.set_rng_state_all(rng["cuda"][: torch.cuda.device_count()])
         envs.np_random.bit_generator.state = json.loads(rng["envs"])
-        counters = ("seed", "total_updates", "global_step", "training_seconds", "wall_seconds")
-        return {name: state["progress"][name] for name in counters}
+        return {name: state["progress"][name] for name in COUNTERS}
     except Exception as error:  # an edited file fails in many ways, all alike to the user
         allowed = "must be whole, and of the script and vehicle as they are"
         fail(f"--resume {run_dir}: its training_state.pt does not fit ({error}); {allowed}")
@@ -584,11 +596,11 @@ def load_state(run_dir, kind, env_ids):
 def save_run(run_dir, state):
     """Write the training state and, derived from it, the weights that evaluation uses; each whole or not at all."""
     torch.save(state, buffer := io.BytesIO())
-    evaluate.write_bytes(run_dir / "training_state.pt", buffer.getbuffer())
+    files.write_bytes(run_dir / "training_state.pt", buffer.getbuffer())
     metadata = {"env_id": state["args"]["env_id"], "args": json.dumps(state["args"]), **state["progress"]}
     weights = {k.removeprefix("module."): v.cpu() for k, v in state["average"].items() if k != "n_averaged"}
     data = safetensors.torch.save(weights, {key: str(value) for key, value in metadata.items()})
-    evaluate.write_bytes(run_dir / "agent.safetensors", data)
+    files.write_bytes(run_dir / "agent.safetensors", data)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -621,23 +633,23 @@ def join_processes(cuda):
         dist.init_process_group("nccl" if gpu else "gloo")
 
 
-def process():
+def rank_and_world_size():
     """Rank and number of the processes that torchrun started; 0, 1 without it."""
     return (dist.get_rank(), dist.get_world_size()) if dist.is_initialized() else (0, 1)
 
 
-def gathered(value):
+def all_gather(value):
     """The values of all processes, in the order of their ranks."""
-    values = [value] * process()[1]
+    values = [value] * rank_and_world_size()[1]
     if dist.is_initialized():
         dist.all_gather_object(values, value)
     return values
 
 
-def own_part(values, count):
+def local_shard(values, count):
     """Of all processes' `values`, in the order of their ranks, the `count` of this one."""
-    rank, _ = process()
-    begin = sum(gathered(count)[:rank])
+    rank, _ = rank_and_world_size()
+    begin = sum(all_gather(count)[:rank])
     return values[begin : begin + count]
 
 
@@ -645,12 +657,12 @@ def sum_gradients(agent):
     """Sum the gradients over all processes, in place, in one buffer: small exchanges cost their latency."""
     if dist.is_initialized():
         gradients = [parameter.grad for parameter in agent.parameters() if parameter.grad is not None]
-        flat = total(torch.cat([gradient.flatten() for gradient in gradients]))
+        flat = all_reduce_sum(torch.cat([gradient.flatten() for gradient in gradients]))
         for gradient, part in zip(gradients, flat.split([gradient.numel() for gradient in gradients])):
             gradient.copy_(part.view_as(gradient))
 
 
-def total(x):
+def all_reduce_sum(x):
     """The sum of a tensor over all processes, in place."""
     if dist.is_initialized():
         dist.all_reduce(x)

@@ -16,17 +16,18 @@ import importlib
 import sys
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import torch
 from matplotlib.figure import Figure
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
-import baselines  # noqa: E402
-import envs  # noqa: E402
-import evaluate  # noqa: E402
-import figures  # noqa: E402
 import runs  # noqa: E402
+from common.checkpoints import read_checkpoint  # noqa: E402
+from common.command_line import OneLineParser, integer  # noqa: E402
+from common.tasks import task_of  # noqa: E402
+from drawing.style import save_figures  # noqa: E402
 
 UNTRAINED = 1 / (1 + np.exp(-2.0))  # lambda under b_g alone
 SCRIPTS = [importlib.import_module(path.stem) for path in sorted(ROOT.glob("ppo_gtrxl_*.py"))]
@@ -34,32 +35,28 @@ SCRIPTS = [importlib.import_module(path.stem) for path in sorted(ROOT.glob("ppo_
 
 def load(checkpoint):
     """The agent of an agent.safetensors, its script's arguments, and the options of its environments."""
-    env_id = evaluate.read_checkpoint(checkpoint, {})["args"]["env_id"]
+    env_id = read_checkpoint(checkpoint, {})["args"]["env_id"]
     (script,) = (script for script in SCRIPTS if env_id in script.ENV_IDS)
     argv = ["--eval-only", "--checkpoint", str(checkpoint)]
     args, saved = runs.parse_args(script.Args, argv, script.ENV_OPTIONS, script.BUFFERS)
     args.dispersion = saved["args"].get("dispersion", 0.0)
     options = {name: getattr(args, name) for name in script.ENV_OPTIONS}
-    agent = script.Agent(args, envs.gym.make_vec(env_id, num_envs=1, **options))
+    agent = script.Agent(args, gym.make_vec(env_id, num_envs=1, **options))
     runs.load_checkpoint(agent, args, saved)
     return agent, args, options
 
 
 def observations(agent, args, options, eval_seed):
-    """One flight of the mean action: what was observed (T, obs) and when (T,) s."""
-    environment = envs.gym.make_vec(args.env_id, num_envs=1, **options)
-    rocket = args.env_id in envs.ROCKETS
-    if rocket:
-        start = {"draw": evaluate.draws(environment.rocket, args.dispersion, eval_seed, 1)} if args.dispersion else {}
-    else:
-        start = {"x0": evaluate.starts(eval_seed, 1, environment.problem.x0_max)}
-    obs, _ = environment.reset(options=start)
-    policy, seen, ended = agent.make_policy(environment.episode_steps), [], np.array([False])
+    """One flight of the mean action: what was observed (T, obs), when (T,) s, and when a new phase began, s."""
+    environment = gym.make_vec(args.env_id, num_envs=1, **options)
+    obs, _ = environment.reset(options=task_of(args.env_id).reset_options(eval_seed, 1, **options))
+    policy, seen, phases, ended = agent.make_policy(environment.episode_steps), [], [], np.array([False])
     while not ended.all():
         seen.append(obs[0])
+        phases.append(environment.phase[0])
         obs, _, ended, _ = environment.advance(policy(obs, len(seen) - 1))
-    dt = environment.rocket.dt if rocket else environment.problem.dt
-    return np.array(seen), dt * np.arange(len(seen))
+    t = environment.dt * np.arange(len(seen))
+    return np.array(seen), t, t[1:][np.diff(phases) > 0]
 
 
 @torch.no_grad()
@@ -96,15 +93,7 @@ def gates(agent, obs):
     return np.array([[lam.mean(), lam.std(correction=0)] for lam in seen]).reshape(len(agent.blocks), 2, 2)
 
 
-def changes(env_id, obs, t):
-    """When a new phase begins on a flight, s."""
-    if env_id in envs.ROCKETS:
-        return t[1:][np.diff(obs[:, 8]) > 0]
-    problem = envs.PROBLEMS[env_id]
-    return problem.dt * np.cumsum([phase.steps for phase in problem.phases])[:-1]
-
-
-def draw(found, t, events, title):
+def attention_figure(found, t, events, title):
     """A panel for each block and head: how far back (s) over the time of the flight (s), the weight as colour."""
     blocks, heads, _, window = found.shape
     dt = t[1] - t[0]
@@ -165,22 +154,22 @@ def gate_lines(found):
 
 
 def main():
-    parser = baselines.OneLineParser(description=__doc__.splitlines()[0])
+    parser = OneLineParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path, help="results/<name> or runs/...")
     parser.add_argument("figure", type=Path, help="the .png to write")
-    parser.add_argument("--eval-seed", type=baselines.integer(0, 2**31 - 1), default=0)
+    parser.add_argument("--eval-seed", type=integer(0, 2**31 - 1), default=0)
     options = parser.parse_args()
     try:
         agent, args, env_options = load(options.folder / "agent.safetensors")
         if not args.num_blocks:
             raise ValueError(f"{options.folder}: num_blocks is 0; a plain MLP has no attention")
-        obs, t = observations(agent, args, env_options, options.eval_seed)
+        obs, t, events = observations(agent, args, env_options, options.eval_seed)
         found = weights(agent, obs)
-        events = changes(args.env_id, obs, t)
         print("\n".join(lines(found, t, events)))
         print("\n".join(gate_lines(gates(agent, obs))))
-        drawn = draw(found, t, events, f"{args.env_id}: attention along one flight (lines: a new phase)")
-        figures.save(options.figure.parent, {options.figure.name: drawn})
+        title = f"{args.env_id}: attention along one flight (lines: a new phase)"
+        figure = attention_figure(found, t, events, title)
+        save_figures(options.figure.parent, {options.figure.name: figure})
     except (OSError, ValueError) as error:
         sys.exit(f"error: {error}")
 

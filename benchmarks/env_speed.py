@@ -15,8 +15,9 @@ import gymnasium as gym
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-import baselines  # noqa: E402
-import envs  # noqa: E402
+import baselines  # noqa: E402, F401 - makes every id known
+from common.command_line import OneLineParser, integer  # noqa: E402
+from common.tasks import env_ids, task_of  # noqa: E402
 
 
 def steps_per_second(env, action, steps, seconds):
@@ -34,25 +35,21 @@ def steps_per_second(env, action, steps, seconds):
 
 
 def main():
-    parser = baselines.OneLineParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--num-envs", type=baselines.integer(1, 10**6), default=128)
-    parser.add_argument("--seconds", type=baselines.integer(1, 3600), default=1)
+    parser = OneLineParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--num-envs", type=integer(1, 10**6), default=128)
+    parser.add_argument("--seconds", type=integer(1, 3600), default=1)
     args = parser.parse_args()
     print(f"{'id':35} {'batch of ' + str(args.num_envs):>14} {'single':>10}   steps/s on one core")
-    rockets = [(env_id, {"action_frame": "local"}) for env_id in envs.ROCKETS]
-    rockets += [(env_id, {**options, "dispersion": 1}) for env_id, options in rockets]
-    for env_id, options in (*((env_id, {}) for env_id in envs.PROBLEMS), *rockets):
-        rates, rocket = [], env_id in envs.ROCKETS
-        batch, single = gym.make_vec(env_id, num_envs=args.num_envs, **options), gym.make(env_id, **options)
-        for env, steps in ((batch, args.num_envs), (single, 1)):
-            env.reset(seed=0)
-            env.action_space.seed(0)
-            action = env.action_space.sample()
-            if rocket:  # steered at random it falls back to the pad in its first steps
-                action = np.broadcast_to([1.0, 0.3, 0.0], action.shape)
-            rates.append(steps_per_second(env, action, steps, args.seconds))
-        name = f"{env_id}, dispersed" if "dispersion" in options else env_id
-        print(f"{name:35} {rates[0]:14,.0f} {rates[1]:10,.0f}")
+    for env_id in env_ids():
+        for label, options, action in task_of(env_id).speed_cases():
+            batch, single = gym.make_vec(env_id, num_envs=args.num_envs, **options), gym.make(env_id, **options)
+            rates = []
+            for env, steps in ((batch, args.num_envs), (single, 1)):
+                env.reset(seed=0)
+                env.action_space.seed(0)
+                flown = env.action_space.sample() if action is None else np.broadcast_to(action, env.action_space.shape)
+                rates.append(steps_per_second(env, flown, steps, args.seconds))
+            print(f"{env_id + label:35} {rates[0]:14,.0f} {rates[1]:10,.0f}")
 
 
 if __name__ == "__main__":

@@ -27,8 +27,8 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 import baselines  # noqa: E402
 import envs  # noqa: E402
-import evaluate  # noqa: E402
-import figures  # noqa: E402
+from common.evaluations import read_json  # noqa: E402
+from drawing.style import save_figures  # noqa: E402
 
 
 @dataclass
@@ -53,16 +53,16 @@ def velocity_from_the_second_step():
 
     Two positions and the action between them tell the velocity, so a memory can know it from the second step on. The
     first action is that of velocity zero, the mean over the starts: the best for the expected quadratic cost (certainty
-    equivalence, e.g. Bertsekas, Dynamic Programming and Optimal Control, vol. 1), and for that alone: laws that cost
+    equivalence, e.g. Bertsekas, Dynamic Programming and Optimal Control, vol. 1), and for that alone: others that cost
     more on average have a lower p95. On 1000 starts and with the bound on u it holds to three digits.
     """
     problem = envs.DOUBLE_INTEGRATOR
-    law, x0 = baselines.lqr_policy(problem), baselines.starts(0, 1000)
+    lqr, x0 = baselines.lqr_policy(problem), baselines.starts(0, 1000)
 
     def blind_at_first(obs, t):
-        return law(obs * [1.0, float(t > 0), 1.0], t)
+        return lqr(obs * [1.0, float(t > 0), 1.0], t)
 
-    flight, best = (envs.fly(problem.env_id, flown, x0) for flown in (blind_at_first, law))
+    flight, best = (envs.fly(problem.env_id, flown, x0) for flown in (blind_at_first, lqr))
     return {"ratio_of_sums": flight["cost"].sum() / best["cost"].sum()}
 
 
@@ -141,7 +141,7 @@ EXPERIMENTS = {
 def read(folder, experiment):
     """The evaluations of every seed: row -> list of eval.json."""
     paths = {row: sorted((folder / row / "seeds").glob("*.json")) for row in experiment.rows}
-    return {row: [evaluate.read_json(path) for path in seeds] for row, seeds in paths.items() if seeds}
+    return {row: [read_json(path) for path in seeds] for row, seeds in paths.items() if seeds}
 
 
 def cell(values):
@@ -179,7 +179,7 @@ def table(experiment, found, by_seed=False):
     return [experiment.title, *(f"  {line}" for line in printed)]
 
 
-def draw(results):
+def memory_figure(results):
     """One panel an experiment: each seed a dot, their median a bar."""
     figure = Figure(figsize=(5 * len(results), 4.5), layout="constrained")
     panels = figure.subplots(1, len(results), squeeze=False)[0]
@@ -226,7 +226,7 @@ def main():
             print("\n".join(table(EXPERIMENTS[name], found, options.by_seed)))
         drawn = {name: found for name, found in results.items() if EXPERIMENTS[name].drawn}
         if drawn and not options.by_seed:
-            figures.save(folder, {"memory.png": draw(drawn)})
+            save_figures(folder, {"memory.png": memory_figure(drawn)})
     except (OSError, ValueError) as error:
         sys.exit(f"error: {error}")
 

@@ -23,7 +23,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "benchmarks"))
 from memory import cell  # noqa: E402
 
-from baselines import OneLineParser, integer  # noqa: E402
+from common.command_line import OneLineParser, integer  # noqa: E402
 
 FOLDER = ROOT / "results" / "peers"
 LOW_PRICE = "--mass-weight 0.3"  # of the propellant: to the one that ours had, which rose to 3, it loses the orbit

@@ -32,10 +32,12 @@ import torch
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
-import baselines  # noqa: E402
 import envs  # noqa: E402
-import evaluate  # noqa: E402
 import runs  # noqa: E402
+from common import files  # noqa: E402
+from common.checkpoints import read_checkpoint  # noqa: E402
+from common.command_line import OneLineParser, integer  # noqa: E402
+from common.tasks import env_ids  # noqa: E402
 
 SCRIPTS = [importlib.import_module(path.stem) for path in sorted(ROOT.glob("ppo_gtrxl_*.py"))]
 NETWORK = ["--embed-dim=8", "--num-heads=2", "--num-blocks=1", "--memory-length=4", "--mlp-dim=8", "--hidden-dim=8"]
@@ -54,14 +56,14 @@ def train(folder, argv, slow_disk):
 
     def write_slowly(path, data):
         data = bytes(data)
-        with evaluate.replacing(path) as file:
+        with files.replacing(path) as file:
             for part in range(20):
                 file.write(data[len(data) * part // 20 : len(data) * (part + 1) // 20])
                 file.flush()
                 time.sleep(0.002)
 
     if slow_disk:
-        evaluate.write_bytes = write_slowly
+        files.write_bytes = write_slowly
     os.chdir(folder)
     sys.stdout = open(os.devnull, "w")
     script.main(argv)
@@ -82,7 +84,7 @@ def finish(folder, *argv):
     (run,) = (folder / "runs").iterdir()
     assert not list(run.glob(".*.tmp")), f"{run} holds what a killed writer left"
     state = torch.load(run / "training_state.pt", weights_only=True)
-    weights = evaluate.read_checkpoint(run / "agent.safetensors", {})["tensors"]
+    weights = read_checkpoint(run / "agent.safetensors", {})["tensors"]
     trained = {name: state[name] for name in ("agent", "average", "optimizer", "rng")}
     return json.loads(json.dumps([trained, weights], default=lambda array: array.tolist()))  # comparable
 
@@ -286,7 +288,7 @@ def random_actions(rng, shape):
 def fuzz_actions(count, seed=0):
     """Actions of every kind to every environment: a finite step, or ValueError with one line."""
     rng, ended = np.random.default_rng(seed), Counter()
-    batches = [gym.make_vec(env_id, num_envs=5) for env_id in (*envs.PROBLEMS, *envs.ROCKETS)]
+    batches = [gym.make_vec(env_id, num_envs=5) for env_id in env_ids()]
     for batch in batches:
         batch.reset(seed=0)
     for _ in range(count):
@@ -352,11 +354,11 @@ def soak(updates):
 
 
 def main():
-    parser = baselines.OneLineParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--kills", type=baselines.integer(0, 10**6), default=50)
-    parser.add_argument("--fuzz", type=baselines.integer(0, 10**9), default=10_000)
-    parser.add_argument("--soak", type=baselines.integer(1, 10**6), default=2000)
-    parser.add_argument("--seed", type=baselines.integer(0, 2**31 - 1), default=0)
+    parser = OneLineParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--kills", type=integer(0, 10**6), default=50)
+    parser.add_argument("--fuzz", type=integer(0, 10**9), default=10_000)
+    parser.add_argument("--soak", type=integer(1, 10**6), default=2000)
+    parser.add_argument("--seed", type=integer(0, 2**31 - 1), default=0)
     args = parser.parse_args()
     torch.set_num_threads(1)
     ended = kill_and_resume(args.kills, args.seed)

@@ -29,9 +29,10 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
-import baselines  # noqa: E402
 import evaluate  # noqa: E402
 import runs  # noqa: E402
+from common.command_line import OneLineParser, integer  # noqa: E402
+from common.evaluations import read_json  # noqa: E402
 
 SCRIPTS = sorted(path.name for path in ROOT.glob("ppo_gtrxl_*.py"))
 MACHINE = ("cuda", "num_threads", "resume")  # arguments that another start may change
@@ -74,7 +75,7 @@ class Job:
         run, shipped = self.run_dir(), self.results / "eval.json"
         if run is None:
             raise ValueError("runs/ holds no run with these arguments")
-        ship = shipped.exists() and evaluate.read_json(shipped)["seed"] == self.args["seed"]
+        ship = shipped.exists() and read_json(shipped)["seed"] == self.args["seed"]
         ships = not numbers and (ship or not shipped.exists())  # a folder that ships none ships what comes first
         if not self.has_numbers(run) or (ships and not self.is_shipped(run)):
             evaluate.publish(run, self.results, ship=ship, numbers=numbers)
@@ -181,9 +182,9 @@ def work(jobs, at_once, numbers):
 def main():
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell ignores it for what it starts in the background
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that `work` ends what it has started
-    parser = baselines.OneLineParser(description=__doc__.splitlines()[0])
+    parser = OneLineParser(description=__doc__.splitlines()[0])
     parser.add_argument("jobs", help="file with one run a line")
-    parser.add_argument("--at-once", type=baselines.integer(1, 64), default=1, help="number of runs at a time")
+    parser.add_argument("--at-once", type=integer(1, 64), default=1, help="number of runs at a time")
     parser.add_argument("--numbers", action="store_true", help="publish evaluations and curves, no policies")
     options = parser.parse_args()
     try:

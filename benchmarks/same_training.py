@@ -24,7 +24,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 import run_seeds  # noqa: E402
 
-from baselines import OneLineParser, integer  # noqa: E402
+from common.command_line import OneLineParser, integer  # noqa: E402
 
 COMMITS = ROOT / "results" / "commits.json"
 LISTS = [ROOT / "benchmarks" / f"{name}_jobs.txt" for name in ("result", "table_1")]

@@ -33,10 +33,11 @@ from stable_baselines3.common.vec_env import VecEnvWrapper, VecMonitor, VecNorma
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
-import envs  # noqa: E402
 import evaluate  # noqa: E402
 import runs  # noqa: E402
-from baselines import OneLineParser  # noqa: E402
+from common.command_line import OneLineParser  # noqa: E402
+from common.files import write_json  # noqa: E402
+from common.tasks import env_ids, task_of  # noqa: E402
 from sb3_env import NativeVecEnv  # noqa: E402
 
 PARTS = 20  # evaluated after each such part of the samples
@@ -82,7 +83,7 @@ class OurCurriculum(BaseCallback):
         std = self.model.policy.log_std.exp().mean().item()
         progress = self.num_timesteps / self.samples
         self.script.set_curriculum(self.batch, self.args, progress, False, std)
-        if self.args.env_id in envs.ROCKETS:
+        if hasattr(self.args, "mass_weight"):
             price = np.interp(progress, [0.25, 0.6, 1.0], [0.0, 1.0, 0.1])
             self.batch.mass_weight = float(self.batch.cutoff * self.args.mass_weight * price)
         self.batch.flights_per_start = 1  # the library compares no flights of one start
@@ -157,10 +158,9 @@ class Evaluation(BaseCallback):
     def __init__(self, env_id, env_options, samples):
         super().__init__()
         self.env_id, self.env_options, self.samples = env_id, env_options, samples
-        self.keys = ["error_norm", "mass_ratio"] if env_id in envs.ROCKETS else ["ratio_of_sums", "ratio_p95"]
-        if env_options.get("dispersion"):
-            self.keys += ["dispersed_error_median", "dispersed_error_p95", "dispersed_box_rate"]
-        self.starts = evaluate.DISPERSED_STARTS if env_options.get("dispersion") else 1000
+        task = task_of(env_id)
+        self.keys = task.progress_keys(**env_options)
+        self.starts = task.default_flights(trains=False, **env_options)
         self.curve, self.metrics, self.seconds = [], {}, 0.0
 
     def _on_training_start(self):
@@ -237,13 +237,18 @@ def commit():
         return None
 
 
+def script_of(env_id):
+    """Our script that trains an id."""
+    return next(script for script in map(importlib.import_module, SCRIPTS) if env_id in script.ENV_IDS)
+
+
 def flag(name):
     return f"--{name.replace('_', '-')}"
 
 
 def parse_args():
     parser = OneLineParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--env-id", default="DoubleIntegrator-v0", choices=[*envs.PROBLEMS, *envs.ROCKETS])
+    parser.add_argument("--env-id", default="DoubleIntegrator-v0", choices=env_ids())
     parser.add_argument("--samples", type=int, default=2_560_000)
     parser.add_argument("--features", default="ours", choices=["ours", "raw"])
     parser.add_argument("--recurrent", action="store_true", help="an LSTM: sb3-contrib's RecurrentPPO")
@@ -268,8 +273,9 @@ def parse_args():
             parser.error(f"{flag(name)} {value}: must be between {low} and {high}")
     if options.seed == 0:
         parser.error("--seed 0: must be at least 1; the evaluation's starts are those of seed 0")
+    script = script_of(options.env_id)
     for name, without in (("dispersion", None), ("mass_weight", 3.0)):
-        if getattr(options, name) != without and options.env_id not in envs.ROCKETS:
+        if getattr(options, name) != without and not hasattr(script.Args, name):
             parser.error(f"{flag(name)} {getattr(options, name)}: only a rocket has it, not {options.env_id}")
     for path in (options.start, options.start and options.start.with_suffix(".pkl")):
         if path and not path.is_file():
@@ -284,7 +290,7 @@ def main():
     options = parse_args()
     code = {"commit": commit(), "flags": shlex.join(sys.argv[1:])}  # now: hours later it may be another
     torch.set_num_threads(1)
-    script = next(s for s in map(importlib.import_module, SCRIPTS) if options.env_id in s.ENV_IDS)
+    script = script_of(options.env_id)
     args = script.Args(env_id=options.env_id)
     given = {name: getattr(options, name) for name in ("dispersion", "mass_weight", "log_std")}
     vars(args).update({name: value for name, value in given.items() if value is not None})
@@ -305,12 +311,12 @@ def main():
     if options.dispersion and options.features == "ours":
         callbacks.append(OurMeanFlight(script, args, venv))
     model.learn(options.samples, callback=callbacks)
-    print(evaluate.table(evaluation.metrics))
+    print(task_of(options.env_id).table(evaluation.metrics))
     if options.save:
         model.save(options.save)
         normalised.save(options.save.with_suffix(".pkl"))
     if options.json:
-        evaluate.write_json(options.json, {**code, "curve": evaluation.curve, "final": evaluation.metrics})
+        write_json(options.json, {**code, "curve": evaluation.curve, "final": evaluation.metrics})
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ import importlib
 import sys
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import torch
 
@@ -23,7 +24,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from attention import load  # noqa: E402
 
 import envs  # noqa: E402
-import evaluate  # noqa: E402
+from rocket.metrics import draws, element_misses, fly_dispersed  # noqa: E402
 
 SCRIPT = importlib.import_module("ppo_gtrxl_rocket")
 FLIGHTS = 341
@@ -33,16 +34,16 @@ NAMES = ("altitude", "climb", "out of plane", "its speed", "speed", "log mass", 
 def fly(agent, args, options, n):
     """n dispersed flights of the mean action: observed (T, n, obs), steps flown (n,), final misses by element (n,)."""
     mission, seen = envs.ROCKETS[args.env_id], []
-    policy = agent.make_policy(envs.gym.make_vec(args.env_id, num_envs=1, **options).episode_steps)
+    policy = agent.make_policy(gym.make_vec(args.env_id, num_envs=1, **options).episode_steps)
 
     def recorded(obs, t):
         seen.append(obs.copy())
         return policy(obs, t)
 
-    z = evaluate.draws(mission.rocket, args.dispersion, args.eval_seed, n)
-    ends = evaluate.fly_dispersed(args.env_id, recorded, z, **options)
+    z = draws(mission.rocket, args.dispersion, args.eval_seed, n)
+    ends = fly_dispersed(args.env_id, recorded, z, **options)
     flown = np.ceil(ends["final_t"] / mission.rocket.dt - 1e-9).astype(int)
-    return torch.tensor(np.stack(seen), dtype=torch.float32), flown, evaluate.element_misses(ends, mission.rocket)
+    return torch.tensor(np.stack(seen), dtype=torch.float32), flown, element_misses(ends, mission.rocket)
 
 
 def explained(inputs, y):

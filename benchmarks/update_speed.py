@@ -36,7 +36,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from one_update import one_update, script_args  # noqa: E402
 
-from figures import save  # noqa: E402
+from drawing.style import save_figures  # noqa: E402
 from runs import keep_memory  # noqa: E402
 
 PAPER = {"num_blocks": 6, "embed_dim": 384, "num_heads": 8, "memory_length": 256, "mlp_dim": 384, "hidden_dim": 384}
@@ -302,7 +302,7 @@ def growth(path, repeats):
         ax.set(xlabel=f"{labels[name]} ({others})", ylabel="seconds of an epoch", xlim=(0, None), ylim=(0, None))
         ax.grid(alpha=0.3)
         ax.legend()
-    save(path.parent, {path.name: figure})
+    save_figures(path.parent, {path.name: figure})
 
 
 def main():

@@ -24,7 +24,7 @@ HERE = Path(__file__).resolve().parent
 PAGE, ROOT = HERE / "walkthrough.md", HERE.parent
 sys.path.insert(0, str(ROOT))
 import envs  # noqa: E402
-import evaluate  # noqa: E402
+from rocket.metrics import altitude_km  # noqa: E402
 
 STEP = re.compile(r"```python\n(.*?)```\n\n```text\n(.*?)```", re.DOTALL)  # code, and what it prints
 
@@ -100,7 +100,7 @@ def ratios(names):
 
 def draw_update(names):
     """Steps 7 to 9: the sampled flights, the advantages along them, and how the update has moved the ratios."""
-    from figures import POLICY, TARGET
+    from drawing.style import POLICY, TARGET
 
     batch = names["batch"]
     x, advantages, ratio = batch.obs[..., :2].numpy(), batch.advantages.numpy(), ratios(names)
@@ -120,14 +120,14 @@ def draw_update(names):
 
 def draw_flight(names):
     """Step 10: altitude, pitch of the thrust, and the error of the orbit in the last seconds, beside the optimum's."""
-    from figures import BOUNDARY, OPTIMUM, POLICY
+    from drawing.style import BOUNDARY, OPTIMUM, POLICY
 
     rocket, flight = envs.ROCKETS[names["args"].env_id].rocket, names["flight"]
     figure, axes = plt.subplots(1, 3, figsize=(9, 2.9), layout="constrained")
     for side, label, style in (("", "policy", POLICY), ("_reference", "optimum", OPTIMUM)):
         t, u, y = (flight[key + side] for key in ("t", "u", "y"))
         up, *_ = envs.local_frame(y[:-1].T, envs.target_axes(rocket)[2])
-        axes[0].plot(t, evaluate.altitude_km(y, rocket), label=label, **style)
+        axes[0].plot(t, altitude_km(y, rocket), label=label, **style)
         axes[1].plot(t[:-1], np.degrees(np.arcsin((u.T * up).sum(axis=0))), **style)
         axes[2].semilogy(t - t[-1], np.linalg.norm(envs.terminal_error(y, rocket), axis=1), **style)
     for ax, title in zip(axes, ("altitude (km)", "pitch of the thrust (degrees)")):

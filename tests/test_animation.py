@@ -6,17 +6,17 @@ import subprocess
 import sys
 from pathlib import Path
 
+import animation
 import gymnasium as gym
 import numpy as np
 import pytest
+from animation import Ascent, Flight, PhasePlane
 from gymnasium.error import ResetNeeded
 from gymnasium.wrappers import RecordVideo, RenderCollection
 from PIL import Image
 
-import animation
 import envs
 import evaluate
-from animation import Ascent, Flight, PhasePlane
 
 ROOT = Path(__file__).parents[1]
 IDS = [*envs.PROBLEMS, *envs.ROCKETS]

@@ -3,12 +3,12 @@
 import json
 import math
 
+import figures
 import numpy as np
 import pytest
 
 import envs
 import evaluate
-import figures
 import runs
 
 CUTOFF, LEO = "RocketAscentCutoff-v0", "TwoStageLEO-v0"

@@ -9,13 +9,13 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import animation
+import figures
 import numpy as np
 import pytest
 
-import animation
 import envs
 import evaluate
-import figures
 
 ROOT = Path(__file__).parent.parent
 SINGLE, WAYPOINTS = "DoubleIntegrator-v0", "DoubleIntegratorWaypoints-v0"

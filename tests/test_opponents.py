@@ -4,16 +4,16 @@ import json
 import shutil
 from pathlib import Path
 
+import comparison
 import numpy as np
+import opponents
 import pytest
+from rocket_baselines import NoOptimum, rocket_reference
 from rocket_oracle import CUTOFF, LEO, PAPER
 
-import comparison
 import envs
 import evaluate
-import opponents
 from envs import ROCKET, ROCKETS
-from rocket_baselines import NoOptimum, rocket_reference
 
 ROOT = Path(__file__).parents[1]
 SHIPPED = ROOT / "results" / "rocket_cutoff"

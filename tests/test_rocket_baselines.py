@@ -12,11 +12,11 @@ from zipfile import ZipFile
 
 import numpy as np
 import pytest
+import rocket_baselines
 from rocket_oracle import single_burn
 
 import baselines
 import envs
-import rocket_baselines
 from baselines import ASCENTS, STORED, nine_pitch_angles, rocket_reference
 from envs import ROCKET, ROCKETS, fly_rocket, rk4
 from envs import ascent as dynamics

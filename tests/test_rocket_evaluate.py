@@ -5,14 +5,14 @@ import json
 import math
 import sys
 
+import animation
+import figures
 import numpy as np
 import pytest
 from test_evaluate import command_line, snapshot
 
-import animation
 import envs
 import evaluate
-import figures
 
 FIXED, CUTOFF, LEO = IDS = ["RocketAscent-v0", "RocketAscentCutoff-v0", "TwoStageLEO-v0"]
 MU, RE = 3.986012e14, 6378145.0

@@ -20,6 +20,7 @@ import types
 from pathlib import Path
 from types import SimpleNamespace
 
+import animation
 import numpy as np
 import pytest
 import safetensors
@@ -27,7 +28,6 @@ import safetensors.torch
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-import animation
 import baselines
 import envs
 import runs

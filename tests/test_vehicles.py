@@ -10,9 +10,11 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+import figures
 import gymnasium as gym
 import numpy as np
 import pytest
+import rocket_baselines
 import spiceypy
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from rocket_oracle import CUTOFF, FIXED, LEO, MU, RE, single_burn
@@ -20,8 +22,6 @@ from rocket_oracle import CUTOFF, FIXED, LEO, MU, RE, single_burn
 import baselines
 import envs
 import evaluate
-import figures
-import rocket_baselines
 from envs import BOOSTER, ROCKET, ROCKETS, BadInput, Burn, Engine, Rocket, register_rocket
 
 ROOT = Path(__file__).resolve().parents[1]

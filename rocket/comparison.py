@@ -2,9 +2,9 @@
 
     python evaluate.py opponents results/rocket_cutoff --also again=results/rocket_cutoff/agent.safetensors
 
-`opponents.py` has the laws and the bound; here they are flown, measured as `evaluate.py` measures a policy, and
-printed. Policies are flown by their script in processes of its own: nothing imports a script, or torch.
-Reading order: policies, all laws on the same draws, table, command.
+`guidance.py` has the opponents; here they are flown, measured as a policy is, and printed. Policies are flown by their
+script in processes of its own: nothing imports a script, or torch.
+Reading order: policies, all on the same draws, table, command.
 """
 
 from __future__ import annotations
@@ -19,14 +19,26 @@ from pathlib import Path
 
 import numpy as np
 
-import envs
-import evaluate
-import opponents
-from envs import BadInput, refuse_unless
+from common.checkpoints import read_checkpoint
+from common.errors import BadInput, refuse_unless
+from common.files import write_json
+from rocket import guidance
+from rocket.dispersion import draw_vehicles
+from rocket.metrics import (
+    AT_ONCE,
+    SUCCESS,
+    decision_us,
+    dispersed_metrics,
+    draws,
+    evaluate_dispersed,
+    final_elements,
+)
+from rocket.missions import ROCKETS
+from rocket.vehicle import Rocket
 
-POLICY_SCRIPT = Path(__file__).with_name("ppo_gtrxl_rocket.py")
+POLICY_SCRIPT = Path(__file__).parents[1] / "ppo_gtrxl_rocket.py"
 PROCESSES = 2  # that solve, and policies flown at a time
-KNOWLEDGE = {  # what each law of ours has to know
+KNOWLEDGE = {  # what each opponent has to know
     "replay": "optimum once",
     "tvlqr": "optimum and its gains once",
     "tvlqr_energy": "optimum and its gains once",
@@ -52,7 +64,7 @@ def fly_checkpoint(path, dispersion: float, eval_seed: int, n: int):
 
     BadInput with the script's own line where it refuses.
     """
-    args = evaluate.read_checkpoint(path, {}, flag="")["args"]
+    args = read_checkpoint(path, {}, flag="")["args"]
     with tempfile.TemporaryDirectory() as folder:
         files = [Path(folder) / name for name in ("eval.json", "eval.npz")]
         flags = {"checkpoint": path, "dispersion": dispersion, "eval-starts": n, "eval-seed": eval_seed}
@@ -70,24 +82,24 @@ def fly_checkpoint(path, dispersion: float, eval_seed: int, n: int):
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# All laws on the same draws
+# Policies and opponents on the same draws
 # ---------------------------------------------------------------------------------------------------------------------
 
 
 class Comparison:
-    """Policies and laws on the first `n` draws of a seed; what solves for each flight, on the first `solved` alone.
+    """Policies and opponents on the first `n` draws of a seed; what solves for each flight on the first `solved`.
 
-    `arrays`: by law, those of `evaluate.evaluate_dispersed`; `about`: by law, `knows` and `decision_us`.
+    `arrays`: by name, those of `evaluate_dispersed`; `about`: by name, `knows` and `decision_us`.
     """
 
     def __init__(self, env_id: str, dispersion: float, eval_seed: int, n: int, solved: int):
-        self.env_id, self.rocket, self.dispersion = env_id, envs.ROCKETS[env_id].rocket, dispersion
+        self.env_id, self.rocket, self.dispersion = env_id, ROCKETS[env_id].rocket, dispersion
         self.eval_seed, self.n, self.solved = eval_seed, n, solved
         self.arrays, self.about, self.optima = {}, {}, []
 
     def fly_policies(self, checkpoints: dict):
         """Fly the policies of these files, name -> agent.safetensors; ValueError where one flew other draws."""
-        z = evaluate.draws(self.rocket, self.dispersion, self.eval_seed, self.n)
+        z = draws(self.rocket, self.dispersion, self.eval_seed, self.n)
         fly = lambda path: fly_checkpoint(path, self.dispersion, self.eval_seed, self.n)  # noqa: E731
         with ThreadPoolExecutor(PROCESSES) as pool:  # each thread waits for a process
             for name, flown in zip(checkpoints, pool.map(fly, checkpoints.values())):
@@ -96,51 +108,51 @@ class Comparison:
                 self.arrays[name], self.about[name] = flown
 
     def fly_opponents(self):
-        """Fly `opponents`' laws, and the optima that know the draw."""
+        """Fly the guidance laws, and the optima that know the draw."""
         env_id = self.env_id
-        self.fly("replay", opponents.replay(env_id), self.n)
-        self.fly("tvlqr", opponents.tvlqr(env_id), self.n)
-        self.fly("tvlqr_energy", opponents.tvlqr(env_id, by_energy=True), self.n)
-        with opponents.Replan(env_id, PROCESSES) as law:
-            self.fly("replan", law, self.solved)
-            self.about["replan"] |= {"solves": len(law.seconds), "solves_failed": law.failed}
-            if law.seconds:
-                self.about["replan"]["decision_us"] = 1e6 * float(np.median(law.seconds))
+        self.fly("replay", guidance.open_loop(env_id), self.n)
+        self.fly("tvlqr", guidance.tvlqr(env_id), self.n)
+        self.fly("tvlqr_energy", guidance.tvlqr(env_id, by_energy=True), self.n)
+        with guidance.Replanning(env_id, PROCESSES) as replanning:
+            self.fly("replan", replanning, self.solved)
+            self.about["replan"] |= {"solves": len(replanning.seconds), "solves_failed": replanning.failed}
+            if replanning.seconds:
+                self.about["replan"]["decision_us"] = 1e6 * float(np.median(replanning.seconds))
         self.optima = self.solve()
-        self.fly("optimum", opponents.fly_optima(env_id, self.optima), self.solved)
+        self.fly("optimum", guidance.fly_optima(env_id, self.optima), self.solved)
 
-    def fly(self, name: str, law, n: int):
-        """Fly a law on the first n draws; what solves tells the time of its decisions itself."""
-        _, self.arrays[name] = evaluate.evaluate_dispersed(self.env_id, law, self.eval_seed, n, self.dispersion)
+    def fly(self, name: str, opponent, n: int):
+        """Fly an opponent on the first n draws; what solves tells the time of its decisions itself."""
+        _, self.arrays[name] = evaluate_dispersed(self.env_id, opponent, self.eval_seed, n, self.dispersion)
         self.about[name] = {"knows": KNOWLEDGE[name]}
         if name not in ("replan", "optimum"):
-            self.about[name]["decision_us"] = evaluate.decision_us(self.env_id, law)
+            self.about[name]["decision_us"] = decision_us(self.env_id, opponent)
 
     def solve(self, reached=None) -> list:
         """The optima that know the draws of the first flights, to the target or to the orbits of `reached`.
 
-        `reached`: states (n, 7) of one law after the other; solved in one go, since processes take seconds to start.
+        `reached`: states (n, 7), competitor by competitor; solved in one go, since processes take seconds to start.
         """
-        z = evaluate.draws(self.rocket, self.dispersion, self.eval_seed, self.solved)
+        z = draws(self.rocket, self.dispersion, self.eval_seed, self.solved)
         if reached is not None:
             z = np.tile(z, (len(reached) // len(z), 1))
-        return opponents.drawn_optima(self.env_id, self.dispersion, z, reached, PROCESSES)
+        return guidance.drawn_optima(self.env_id, self.dispersion, z, reached, PROCESSES)
 
     def metrics(self, name: str, n: int) -> dict:
-        """The `dispersed_...` metrics of a law's first n flights, or of all where it flew fewer."""
+        """The `dispersed_...` metrics of a competitor's first n flights, or of all where it flew fewer."""
         flights = recorded_flights(
             {key: value[:n] for key, value in self.arrays[name].items()}, self.rocket, self.dispersion
         )
         starts = len(flights["error_norm"])
-        return {"dispersed_starts": starts} | evaluate.dispersed_metrics(flights, self.rocket)
+        return {"dispersed_starts": starts} | dispersed_metrics(flights, self.rocket)
 
     def shares(self, name: str, reached: list) -> dict:
-        """A law's mass over that of the optimum that knows the draw: to the target, and to the orbit that it `reached`.
+        """A competitor's mass over that of the optimum that knows the draw: to the target, and to the orbit `reached`.
 
         Of those of the first flights that are successes and whose optimum was found.
         """
         ends, shares = {key: value[: self.solved] for key, value in self.arrays[name].items()}, {}
-        success = np.linalg.norm(ends["final_error"], axis=1) < evaluate.SUCCESS
+        success = np.linalg.norm(ends["final_error"], axis=1) < SUCCESS
         for key, optima in (("target", self.optima), ("reached", reached)):
             mass = np.array([optimum["final_mass"] if optimum else np.nan for optimum in optima])
             share = (ends["final_y"][:, 6] / mass)[success & np.isfinite(mass)]
@@ -150,24 +162,24 @@ class Comparison:
         return shares
 
     def report(self) -> dict:
-        """What opponents.json holds: of each law its metrics, those of its first flights (`first`), and `shares`."""
+        """What opponents.json holds: of each its metrics, those of its first flights (`first`), and `shares`."""
         report = {"env_id": self.env_id, "dispersion": self.dispersion, "eval_seed": self.eval_seed}
         masses = [optimum["final_mass"] for optimum in self.optima if optimum]
         report["bound_flights"] = len(masses)
         if masses:
             report["bound_mass_mean_kg"] = float(np.mean(masses))
         reached = self.solve(np.concatenate([arrays["final_y"][: self.solved] for arrays in self.arrays.values()]))
-        laws = {}
+        competitors = {}
         for k, (name, about) in enumerate(self.about.items()):
             shares = self.shares(name, reached[k * self.solved : (k + 1) * self.solved])
-            laws[name] = about | self.metrics(name, self.n) | {"first": self.metrics(name, self.solved)} | shares
-        return report | {"laws": laws}
+            competitors[name] = about | self.metrics(name, self.n) | {"first": self.metrics(name, self.solved)} | shares
+        return report | {"laws": competitors}
 
 
-def recorded_flights(arrays: dict, rocket: envs.Rocket, dispersion: float) -> dict:
-    """What `evaluate.dispersed_metrics` reads, of flights (n,) as eval.npz has them."""
-    y, burn_out = arrays["final_y"], envs.draw_vehicles(rocket, dispersion, arrays["draw"]).burn_out
-    flights = evaluate.final_elements(y, rocket) | {"final_mass_kg": y[:, 6]}
+def recorded_flights(arrays: dict, rocket: Rocket, dispersion: float) -> dict:
+    """What `dispersed_metrics` reads, of flights (n,) as eval.npz has them."""
+    y, burn_out = arrays["final_y"], draw_vehicles(rocket, dispersion, arrays["draw"]).burn_out
+    flights = final_elements(y, rocket) | {"final_mass_kg": y[:, 6]}
     flights |= {
         "error_norm": np.linalg.norm(arrays["final_error"], axis=1),
         "dry": arrays["final_t"] >= burn_out - 1e-6,
@@ -185,47 +197,56 @@ WIDTHS = (7, 16, 8, 8, 16, 24, 9, 14, 14, 10, 0)
 
 
 def table(report: dict) -> str:
-    """opponents.json as a table: a line a law, then the first flights of the laws that flew more."""
-    laws, bound = report["laws"], report["bound_flights"]
-    fewest = min(law["dispersed_starts"] for law in laws.values())
-    rows = [("", *COLUMNS), *((name, *cells(law, law, bound)) for name, law in laws.items())]
-    more = {name: law for name, law in laws.items() if law["dispersed_starts"] > fewest}
-    rows += [(f"{name}, the first", *cells(law, law["first"], bound)) for name, law in more.items()]
+    """opponents.json as a table: a line a competitor, then the first flights of those that flew more."""
+    competitors, known = report["laws"], report["bound_flights"]
+    fewest = min(entry["dispersed_starts"] for entry in competitors.values())
+    rows = [("", *COLUMNS)]
+    rows += [(name, *cells(entry, entry, known)) for name, entry in competitors.items()]
+    for name, entry in competitors.items():
+        if entry["dispersed_starts"] > fewest:
+            rows.append((f"{name}, the first", *cells(entry, entry["first"], known)))
     width = max(len(row[0]) for row in rows)
     draws = f"the draws of eval seed {report['eval_seed']}, the same for all"
     lines = [f"{report['env_id']} at dispersion {report['dispersion']:g}, {draws}"]
     for name, *others in rows:
         lines.append(f"  {name:<{width}}" + "".join(f"  {cell:>{w}}" for cell, w in zip(others, WIDTHS)))
     lines.append("  Shares: mean mass over that of the optimum that knows the draw, to the target and to the orbit")
-    flights = f"of {bound} flights; of fewer (in brackets) where a law missed the orbit."
+    flights = f"of {known} flights; of fewer (in brackets) where a law missed the orbit."
     lines.append(f"    that was reached, {flights}")
     if "bound_mass_mean_kg" in report:
         lines[-1] += f" To the target it leaves {report['bound_mass_mean_kg']:.2f} kg on average."
-    return "\n".join(
-        [*lines, f"  replan: {laws['replan']['solves']} solves, {laws['replan']['solves_failed']} failed."]
-    )
+    solves, failed = (competitors["replan"][key] for key in ("solves", "solves_failed"))
+    return "\n".join([*lines, f"  replan: {solves} solves, {failed} failed."])
 
 
-def share(law: dict, name: str, bound_flights: int) -> str:
-    """A law's share of the bound's mass, with the number of its flights where they are not all that have a bound."""
-    if f"share_{name}_mean" not in law:
+def share(entry: dict, name: str, known: int) -> str:
+    """A competitor's share of the optima's mass, with the number of its flights where they are not all `known` ones."""
+    if f"share_{name}_mean" not in entry:
         return "-"
-    flights = law[f"share_{name}_flights"]
-    return f"{law[f'share_{name}_mean']:.3%}" + (f" ({flights})" if flights != bound_flights else "")
+    flights = entry[f"share_{name}_flights"]
+    return f"{entry[f'share_{name}_mean']:.3%}" + (f" ({flights})" if flights != known else "")
 
 
-def cells(law: dict, metrics: dict, bound_flights: int) -> list[str]:
-    """A law's cells of the table: those of its `metrics`, then what does not depend on how many flights they are of."""
-    found = [str(metrics["dispersed_starts"])]
-    found += [
-        f"{metrics[f'dispersed_error_{name}']:.{digits}f}" for name, digits in (("median", 6), ("p95", 6), ("max", 6))
-    ]
+def cells(entry: dict, metrics: dict, known: int) -> list[str]:
+    """A competitor's cells: those of its `metrics`, then what does not depend on how many flights they are of.
+
+    known: how many flights have an optimum that knows their draw.
+    """
+    errors = [f"{metrics[f'dispersed_error_{name}']:.6f}" for name in ("median", "p95", "max")]
     perigee = [metrics.get(f"dispersed_perigee_error_{part}_km") for part in ("mean", "std")]
-    found.append("-" if None in perigee else f"{perigee[0]:+.2f} ± {perigee[1]:.2f}")
+    perigee = "-" if None in perigee else f"{perigee[0]:+.2f} ± {perigee[1]:.2f}"
     rate, low, high = (metrics[f"dispersed_box_{part}"] for part in ("rate", "low", "high"))
-    found += [f"{rate:.1%} ({low:.1%} to {high:.1%})", f"{metrics['dispersed_mass_mean_kg']:.2f}"]
-    found += [share(law, name, bound_flights) for name in ("target", "reached")]
-    return [*found, duration(law.get("decision_us")), law["knows"]]
+    return [
+        str(metrics["dispersed_starts"]),
+        *errors,
+        perigee,
+        f"{rate:.1%} ({low:.1%} to {high:.1%})",
+        f"{metrics['dispersed_mass_mean_kg']:.2f}",
+        share(entry, "target", known),
+        share(entry, "reached", known),
+        duration(entry.get("decision_us")),
+        entry["knows"],
+    ]
 
 
 def duration(microseconds: float | None) -> str:
@@ -240,43 +261,43 @@ def duration(microseconds: float | None) -> str:
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def check(folder: Path, n: int, solved: int, checkpoints: dict) -> str:
-    """The environment id of a results folder; BadInput, before anything is flown, where the flags do not fit it."""
-    env_id = evaluate.read_json(folder / "eval.json")["env_id"]
-    has_optimum = env_id in envs.ROCKETS and envs.ROCKETS[env_id].cutoff
-    refuse_unless(has_optimum, f"the env_id of {folder}", env_id, "must be a rocket's with cut-off")
-    most = min(n, evaluate.AT_ONCE)
-    refuse_unless(
-        solved <= most, "--solved", solved, f"must be at most {most}: --starts is {n}, a batch {evaluate.AT_ONCE}"
-    )
+def check(env_id: str, folder: Path, n: int, solved: int, checkpoints: dict):
+    """BadInput, before anything is flown, where the flags do not fit a results folder of this id."""
+    refuse_unless(ROCKETS[env_id].cutoff, f"the env_id of {folder}", env_id, "must be a rocket's with cut-off")
+    most = min(n, AT_ONCE)
+    allowed = f"must be at most {most}: --starts is {n}, a batch {AT_ONCE}"
+    refuse_unless(solved <= most, "--solved", solved, allowed)
     for path in checkpoints.values():
-        other = evaluate.read_checkpoint(path, {}, flag="")["args"]["env_id"]
+        other = read_checkpoint(path, {}, flag="")["args"]["env_id"]
         refuse_unless(other == env_id, f"the env_id of {path}", other, f"must be {env_id}, as that of {folder}")
     refuse_unless(os.access(folder, os.W_OK), "the folder", folder, "must be writable")
-    return env_id
 
 
-def run(folder: Path, dispersion: float, n: int, solved: int, eval_seed: int, also=()):
+def compare(env_id: str, folder: Path, dispersion: float, n: int, solved: int, eval_seed: int, also=()):
     """Compare a results folder's policy, and those of `also` (name, path), with all opponents; print and write it.
 
     opponents.json and figures/opponents.png are written when all is flown. OSError or ValueError says what is bad.
     """
     checkpoints = {"policy": folder / "agent.safetensors"}
     for name, path in also:
-        refuse_unless(
-            name not in {*checkpoints, *KNOWLEDGE}, "the NAME of --also", name, "must be that of no other law"
-        )
+        is_new = name not in {*checkpoints, *KNOWLEDGE}
+        refuse_unless(is_new, "the NAME of --also", name, "must be that of no other law")
         checkpoints[name] = path
-    comparison = Comparison(check(folder, n, solved, checkpoints), dispersion, eval_seed, n, solved)
+    check(env_id, folder, n, solved, checkpoints)
+    comparison = Comparison(env_id, dispersion, eval_seed, n, solved)
     comparison.fly_policies(checkpoints)
     comparison.fly_opponents()
-    import figures
-
     report, labelled = comparison.report(), {}
-    for name, law in report["laws"].items():
-        labelled[f"{name}: {law['dispersed_box_rate']:.1%} of {law['dispersed_starts']}"] = comparison.arrays[name]
-    figure = figures.draw_dispersed(labelled, report)
-    evaluate.write_json(folder / "opponents.json", report)
+    for name, entry in report["laws"].items():
+        label = f"{name}: {entry['dispersed_box_rate']:.1%} of {entry['dispersed_starts']}"
+        labelled[label] = comparison.arrays[name]
+
+    from drawing.style import save_figures
+    from rocket.figures import dispersed_figure
+
+    title = f"{env_id} at dispersion {dispersion:g}"
+    figure = dispersed_figure(comparison.rocket, labelled, title)
+    write_json(folder / "opponents.json", report)
     print(table(report))
-    for path in figures.save(folder / "figures", {"opponents.png": figure}):
+    for path in save_figures(folder / "figures", {"opponents.png": figure}):
         print(path)

@@ -1,15 +1,15 @@
-"""Opponents of a policy on dispersed flights: laws that know the nominal optimum or model, and the bound on the mass.
+"""Classical guidance on dispersed flights, and the optimum that knows each draw: a policy's opponents.
 
-    replay        the optimum's directions, open loop
-    tvlqr         time-varying LQR about the optimum
-    Replan        open loop through the air, then IPOPT with the nominal model from the measured state, every 20 s
-    drawn_optima  the optimum of each flight's own vehicle and air: a bound, not a law
+    open_loop        the optimum's directions
+    tvlqr            time-varying LQR about the optimum
+    Replanning       open loop through the air, then IPOPT with the nominal model from the measured state, every 20 s
+    drawn_optima     the optimum of each flight's own vehicle and air: an upper bound on the mass, not a guidance law
 
-A law is `policy(obs (m, obs), t) -> action (m, 3)`, directions in ECI, as `evaluate.evaluate_dispersed` flies it with
+A guidance law is `policy(obs (m, obs), t) -> action (m, 3)`, directions in ECI, as `evaluate_dispersed` flies it with
 the environment's own `action_frame="eci"`; it sees r and v without noise, as a policy does, the flight computer's mass,
 time and phase, never the draw.
-Reading order: replay, LQR, the program of the rest of an ascent, replanning, the bound. `comparison.py` flies, compares
-and prints them. CasADi is imported only where it solves.
+Reading order: open loop, LQR, the program of the remaining ascent, replanning, the optimum that knows the draw.
+`comparison.py` flies, compares and prints them. CasADi is imported only where it solves.
 """
 
 from __future__ import annotations
@@ -17,43 +17,40 @@ from __future__ import annotations
 import time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from functools import cache, lru_cache
+from functools import cache
 from multiprocessing import get_context
 from typing import NamedTuple
 
 import numpy as np
 
-import envs
-from envs import Mission, Rocket
-from rocket_baselines import (
+from common.errors import NoOptimum
+from common.ipopt import interruptible
+from rocket.dispersion import draw_vehicles
+from rocket.environment import RocketVectorEnv
+from rocket.missions import ROCKETS, Mission
+from rocket.optimum import (
     GAUSS_POINTS,
     MAX_ITERATIONS,
-    NoOptimum,
     collocation,
     interpolate,
-    interruptible,
+    kept_reference,
     orbit_defect,
-    rocket_reference,
     state_scale,
 )
+from rocket.orbits import orbit_vectors, specific_energy, target_orbit, terminal_error
+from rocket.vehicle import Rocket
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Open loop
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-@lru_cache(maxsize=4)
-def kept_optimum(env_id: str, mission: Mission) -> dict:
-    """`rocket_reference`, flown once; the mission tells apart what an id was registered for before and is now."""
-    return rocket_reference(env_id)
-
-
 def nominal_optimum(env_id: str) -> dict:
     """The optimum of the nominal vehicle as the environment flies it: t, u, y and more."""
-    return kept_optimum(env_id, envs.ROCKETS[env_id])
+    return kept_reference(env_id, ROCKETS[env_id])
 
 
-def replay(env_id: str):
+def open_loop(env_id: str):
     """The optimum's directions in ECI by time, the last one held where a flight lasts longer."""
     u = nominal_optimum(env_id)["u"]
     return lambda obs, t: np.repeat(u[None, min(t, len(u) - 1)], len(obs), axis=0)
@@ -89,7 +86,7 @@ def linearise_flight(mission: Mission, flight: dict, axes):
     """
     h = np.repeat([10.0, 0.01, 1e-4], [3, 3, 2])
     shifts = np.concatenate([np.diag(h), -np.diag(h)])  # (16, 8)
-    env = envs.RocketVectorEnv(len(shifts), replace(mission, cutoff=False))
+    env = RocketVectorEnv(len(shifts), replace(mission, cutoff=False))
     env.end_time = flight["t"][-1]
     env.reset()
     jacobians = []
@@ -110,9 +107,7 @@ def cutoff_jacobian(rocket: Rocket, y, rate):
     """
     h = np.repeat([10.0, 0.01], 3)
     states = y[:6] + np.concatenate([np.diag(h), -np.diag(h)])
-    values = np.column_stack(
-        [envs.terminal_error(states, rocket), envs.specific_energy(states.T, rocket.mu)]
-    )  # (12, 7)
+    values = np.column_stack([terminal_error(states, rocket), specific_energy(states.T, rocket.mu)])  # (12, 7)
     *error, energy = ((values[:6] - values[6:]) / (2 * h[:, None])).T
     return np.array(error) @ (np.eye(6) - np.outer(rate, energy) / (energy @ rate))
 
@@ -145,17 +140,17 @@ def tvlqr(env_id: str, by_energy: bool = False, steering_weight: float = STEERIN
     others than the reported: median ||error|| by time and by energy 2.5e-5 and 1.8e-5 with R = 1e-7, 1.7e-5 and 1.4e-5
     with 1e-8, 1.9e-5 and 1.3e-5, at a greater p95, with 1e-9; with a tilt of 0.3 rad the same.
     """
-    mission, flight = envs.ROCKETS[env_id], nominal_optimum(env_id)
+    mission, flight = ROCKETS[env_id], nominal_optimum(env_id)
     (gains, axes), y, u = lqr_gains(mission, flight, steering_weight), flight["y"], flight["u"]
     gains[-1], axes[-1] = gains[-2], axes[-2]  # the last step is cut short: its gain would be far too large for a whole
     ignition = int(np.searchsorted(flight["t"], mission.rocket.last_ignition))
-    energy = np.maximum.accumulate(envs.specific_energy(y[ignition:].T, mission.rocket.mu))
+    energy = np.maximum.accumulate(specific_energy(y[ignition:].T, mission.rocket.mu))
     phi_last = min(len(mission.rocket.burns) - 1, 1)  # as observed in the last burn
 
     def policy(obs, t):
         place = np.full(len(obs), min(t, len(u) - 1.0))  # along the optimum, in its steps
         if by_energy:
-            now = np.interp(envs.specific_energy(obs.T, mission.rocket.mu), energy, np.arange(ignition, len(y)))
+            now = np.interp(specific_energy(obs.T, mission.rocket.mu), energy, np.arange(ignition, len(y)))
             place = np.where(obs[:, 8] >= phi_last, now, place)
         step = np.minimum(place.astype(int), len(u) - 1)
         part, nearest = (place - step)[:, None], np.minimum(np.rint(place).astype(int), len(u) - 1)
@@ -167,13 +162,13 @@ def tvlqr(env_id: str, by_energy: bool = False, steering_weight: float = STEERIN
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The rest of an ascent, from any state in any vehicle and air: one nonlinear program, built once
+# The remaining ascent, from any state in any vehicle and air: one nonlinear program, built once
 # ---------------------------------------------------------------------------------------------------------------------
 
 CALM = (1.0, 0.0, 0.0)  # nominal air: the factor on the drag, the wind towards east and north in m/s
 
 
-class Rest(NamedTuple):
+class RemainingAscent(NamedTuple):
     """What is left of an ascent. The arcs' columns are as `Rocket.arcs` has them, the mass that at their begin."""
 
     begin: float  # s
@@ -188,10 +183,10 @@ class Rest(NamedTuple):
 
 
 @cache
-def rest_solver(rocket: Rocket, fixed: int, last: int):
+def remaining_solver(rocket: Rocket, fixed: int, last: int):
     """IPOPT for `fixed` intervals of known ends and `last` ones that share the last arc, of unknown duration.
 
-    The program is that of `rocket_baselines.ascent_program` with free final time, its numbers being parameters. The
+    The program is that of `optimum.ascent_program` with free final time, its numbers being parameters. The
     rocket gives the Earth and the drag's area alone.
     """
     import casadi as ca
@@ -212,58 +207,59 @@ def rest_solver(rocket: Rocket, fixed: int, last: int):
     program |= {"f": duration / (scale[0] / scale[3]), "g": constraints}
     options = {"expand": True, "print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.tol": 1e-9}
     options |= {"ipopt.max_iter": MAX_ITERATIONS}
-    return ca.nlpsol("rest", "ipopt", program, options)
+    return ca.nlpsol("remaining", "ipopt", program, options)
 
 
-def rest_grid(rest: Rest, intervals, end: float):
-    """Ends of the intervals (n+1,) and times of the directions (n * points,), s, of a rest that lasts until `end`."""
-    edges = [rest.begin, *rest.end[:-1], end]
+def remaining_grid(remaining: RemainingAscent, intervals, end: float):
+    """Ends of the intervals (n+1,) and times of the directions (n * points,), s, of one that lasts until `end`."""
+    edges = [remaining.begin, *remaining.end[:-1], end]
     pieces = (np.linspace(a, b, k + 1)[1:] for a, b, k in zip(edges, edges[1:], intervals))
-    t = np.concatenate([[rest.begin], *pieces])
+    t = np.concatenate([[remaining.begin], *pieces])
     return t, (t[:-1, None] + np.diff(t)[:, None] * GAUSS_POINTS).ravel()
 
 
-def rest_parameters(rocket: Rocket, rest: Rest, intervals) -> np.ndarray:
-    """The parameters of `rest_solver` in its order."""
+def remaining_parameters(rocket: Rocket, remaining: RemainingAscent, intervals) -> np.ndarray:
+    """The parameters of `remaining_solver` in its order."""
     fixed = sum(intervals[:-1])
-    t, arc = rest_grid(rest, intervals, rest.end[-1])[0], np.repeat(np.arange(len(intervals)), intervals)
-    mass = rest.mass[arc] - rest.flow[arc] * (t[:-1] - np.append(rest.begin, rest.end)[arc])
-    engine = np.array([mass, rest.thrust[arc], rest.flow[arc], np.diff(t)])[:, :fixed]
-    start = rest.state / state_scale(rocket)
+    t, arc = remaining_grid(remaining, intervals, remaining.end[-1])[0], np.repeat(np.arange(len(intervals)), intervals)
+    mass = remaining.mass[arc] - remaining.flow[arc] * (t[:-1] - np.append(remaining.begin, remaining.end)[arc])
+    engine = np.array([mass, remaining.thrust[arc], remaining.flow[arc], np.diff(t)])[:, :fixed]
+    start = remaining.state / state_scale(rocket)
     start[3] += 1e-16  # as in ascent_program
-    burn = rest.mass[-1], rest.thrust[-1], rest.flow[-1]
-    return np.concatenate([start, engine.T.ravel(), burn, rest.air, rest.h, rest.e])
+    burn = remaining.mass[-1], remaining.thrust[-1], remaining.flow[-1]
+    return np.concatenate([start, engine.T.ravel(), burn, remaining.air, remaining.h, remaining.e])
 
 
 @interruptible()
-def optimise_rest(rocket: Rocket, rest: Rest, guess: dict, intervals: tuple[int, ...]) -> dict:
-    """The heaviest end of an ascent's rest, `intervals` of collocation in each of its arcs.
+def optimise_remaining(rocket: Rocket, remaining: RemainingAscent, guess: dict, intervals: tuple[int, ...]) -> dict:
+    """The heaviest end of a remaining ascent, `intervals` of collocation in each of its arcs.
 
     The guess has t (s), y (r, v), t_u (s), u, as has what is returned, with `final_time` (s) and `final_mass` (kg).
     Raises NoOptimum where IPOPT finds none.
     """
     n, points, scale = sum(intervals), len(GAUSS_POINTS), state_scale(rocket)
-    solve, ignition = rest_solver(rocket, sum(intervals[:-1]), intervals[-1]), np.append(rest.begin, rest.end)[-2]
-    t, t_u = rest_grid(rest, intervals, guess["t"][-1])
+    solve = remaining_solver(rocket, sum(intervals[:-1]), intervals[-1])
+    ignition = np.append(remaining.begin, remaining.end)[-2]  # of the last arc
+    t, t_u = remaining_grid(remaining, intervals, guess["t"][-1])
     states = interpolate(np.append(t[1:], t_u), guess["t"], guess["y"]) / scale
     directions = interpolate(t_u, guess["t_u"], guess["u"])
     w = np.concatenate([states.ravel(), directions.ravel(), [t[-1] - ignition]])
     box = np.full(len(w) - 1, 2.0)  # as in ascend
     equal, radius = np.zeros(n * (7 * points + 6) + 5), np.full(n, 1 + 1 / rocket.Re)
-    bounds = {"lbx": np.append(-box, 0.0), "ubx": np.append(box, rest.end[-1] - ignition)}
+    bounds = {"lbx": np.append(-box, 0.0), "ubx": np.append(box, remaining.end[-1] - ignition)}
     bounds |= {"lbg": np.append(equal, radius), "ubg": np.append(equal, np.full(n, np.inf))}
-    solution = solve(x0=w, p=rest_parameters(rocket, rest, intervals), **bounds)
+    solution = solve(x0=w, p=remaining_parameters(rocket, remaining, intervals), **bounds)
     status = solve.stats()["return_status"]
     if status != "Solve_Succeeded":
-        raise NoOptimum(f"the rest of an ascent from {rest.begin} s: IPOPT stopped with {status}")
+        raise NoOptimum(f"the remaining ascent from {remaining.begin} s: IPOPT stopped with {status}")
     w = solution["x"].full()[:, 0]
     end = ignition + w[-1]
-    t, t_u = rest_grid(rest, intervals, end)
+    t, t_u = remaining_grid(remaining, intervals, end)
     times, states = np.append(t[1:], t_u), w[: 6 * n * (1 + points)].reshape(-1, 6) * scale
     order = np.argsort(times)
-    found = {"t": np.append(rest.begin, times[order]), "y": np.vstack([rest.state, states[order]])}
+    found = {"t": np.append(remaining.begin, times[order]), "y": np.vstack([remaining.state, states[order]])}
     found |= {"t_u": t_u, "u": w[6 * n * (1 + points) : -1].reshape(-1, 3), "status": status}
-    return found | {"final_time": end, "final_mass": rest.mass[-1] - rest.flow[-1] * w[-1]}
+    return found | {"final_time": end, "final_mass": remaining.mass[-1] - remaining.flow[-1] * w[-1]}
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -276,7 +272,7 @@ REPLAN_INTERVALS = 8  # of collocation: 12 change the final mass by less than 1e
 
 
 def optimum_guess(env_id: str) -> dict:
-    """The nominal optimum as a guess of `optimise_rest`."""
+    """The nominal optimum as a guess of `optimise_remaining`."""
     flight = nominal_optimum(env_id)
     middle = (flight["t"][:-1] + flight["t"][1:]) / 2
     return {"t": flight["t"], "y": flight["y"][:, :6], "t_u": middle, "u": flight["u"]}
@@ -287,32 +283,35 @@ def middles(rocket: Rocket):
     return rocket.dt * (np.arange(np.ceil(1.5 * rocket.end_time / rocket.dt)) + 0.5)
 
 
-def held(plan: dict, times):
+def directions_at(plan: dict, times):
     """A plan's directions (m, 3) at `times` (m,) in s, those at its end after it."""
     from scipy.interpolate import CubicSpline
 
     return CubicSpline(plan["t_u"], plan["u"])(np.minimum(times, plan["final_time"]))
 
 
-def replan_one(task):
-    """The plan of one flight, None where IPOPT finds none, and its seconds on one core; task: (rocket, rest, guess)."""
-    rocket, rest, guess = task
-    rest_solver(rocket, 0, REPLAN_INTERVALS)  # built before the clock runs
+def replan_one(job):
+    """The plan of one flight, None where IPOPT finds none, and its seconds on one core.
+
+    job: (rocket, remaining ascent, guess).
+    """
+    rocket, remaining, guess = job
+    remaining_solver(rocket, 0, REPLAN_INTERVALS)  # built before the clock runs
     begin = time.process_time()
     try:
-        plan = optimise_rest(rocket, rest, guess, (REPLAN_INTERVALS,))
+        plan = optimise_remaining(rocket, remaining, guess, (REPLAN_INTERVALS,))
     except NoOptimum:
         plan = None
     return plan, time.process_time() - begin
 
 
-class Replan:
+class Replanning:
     """What launchers do, as a policy: open loop until the last stage has been lit, then explicit guidance.
 
-    Every `REPLAN_EVERY` seconds the rest of the ascent is solved again, from the r, v observed and the flight
-    computer's mass, with the *nominal* thrust and flow, for the orbit of the target with the least propellant; its
-    directions are flown until the next plan, and after the last one, held, until the cut-off. A launcher also measures
-    its acceleration and corrects thrust and mass by it; this one does not. Where IPOPT fails, the last plan is kept.
+    Every `REPLAN_EVERY` seconds the remaining ascent is solved again, from the r, v observed and the flight computer's
+    mass, with the *nominal* thrust and flow, for the orbit of the target with the least propellant; its directions are
+    flown until the next plan, and those of the last plan until the cut-off. A launcher also measures its acceleration
+    and corrects thrust and mass by it; this one does not. Where IPOPT fails, the last plan is kept.
     On 60 draws of eval seed 1, others than the reported ones, p95 of ||error|| was 0.00012; replanned until 30 or 40 s
     before the cut-off 0.00014 and 0.00026, every 10 s until 10 s 0.00004, every 4 s until 10 s 0.00002.
 
@@ -321,9 +320,9 @@ class Replan:
     """
 
     def __init__(self, env_id: str, processes: int = 1):
-        self.rocket, self.guess, self.replay = envs.ROCKETS[env_id].rocket, optimum_guess(env_id), replay(env_id)
+        self.rocket, self.guess, self.open_loop = ROCKETS[env_id].rocket, optimum_guess(env_id), open_loop(env_id)
         self.middles = middles(self.rocket)
-        self.target = envs.target_orbit(self.rocket.target, self.rocket.mu)
+        self.target = target_orbit(self.rocket.target, self.rocket.mu)
         self.failed, self.seconds = 0, []
         self.processes, self.pool = processes, None
         if processes > 1:
@@ -339,86 +338,96 @@ class Replan:
     def __call__(self, obs, t):
         if t == 0:
             self.plans = [self.guess] * len(obs)
-            self.u = np.stack([self.replay(obs, step) for step in range(len(self.middles))], axis=1)  # (m, steps, 3)
+            # (m, steps, 3) directions
+            self.u = np.stack([self.open_loop(obs, step) for step in range(len(self.middles))], axis=1)
         if t % round(REPLAN_EVERY / self.rocket.dt) == 0:
-            self.replan(obs, t)
+            self._replan(obs, t)
         return self.u[:, min(t, len(self.middles) - 1)]
 
-    def replan(self, obs, t):
+    def _replan(self, obs, t):
         """New plans from step t on for the flights of obs (m, 9) in the last burn that are not about to end it."""
-        rocket, now = self.rocket, self.rocket.dt * t
-        burn = rocket.burns[-1]
-        flow = burn.flow(rocket.table_isp)
-        lit = obs[:, 8] >= min(len(rocket.burns) - 1, 1)
-        who = [k for k in np.flatnonzero(lit) if self.plans[k]["t"][-1] - now > LAST_REPLAN]
-        tasks = []
-        for k in who:
-            latest = now + (obs[k, 6] - rocket.dry_mass) / flow
-            arc = (np.array([value]) for value in (latest, burn.thrust, flow, obs[k, 6]))
-            tasks.append((rocket, Rest(now, obs[k, :6], *arc, *self.target), self.plans[k]))
-        chunk = -(-len(tasks) // (2 * self.processes)) or 1
-        found = self.pool.map(replan_one, tasks, chunksize=chunk) if self.pool else map(replan_one, tasks)
-        for k, (plan, seconds) in zip(who, found):
+        now = self.rocket.dt * t
+        in_last_burn = obs[:, 8] >= min(len(self.rocket.burns) - 1, 1)
+        flights = [k for k in np.flatnonzero(in_last_burn) if self.plans[k]["t"][-1] - now > LAST_REPLAN]
+        jobs = [(self.rocket, self._remaining_ascent(obs[k], now), self.plans[k]) for k in flights]
+        for k, (plan, seconds) in zip(flights, self._solve(jobs)):
             self.seconds.append(seconds)
-            self.failed += plan is None
-            if plan:
-                self.plans[k], self.u[k, t:] = plan, held(plan, self.middles[t:])
+            if plan is None:
+                self.failed += 1
+                continue
+            self.plans[k] = plan
+            self.u[k, t:] = directions_at(plan, self.middles[t:])
+
+    def _remaining_ascent(self, obs, now: float) -> RemainingAscent:
+        """What is left of the last burn at `now` (s) of a flight of obs (9,), with the nominal thrust and flow."""
+        burn, mass = self.rocket.burns[-1], obs[6]
+        flow = burn.flow(self.rocket.table_isp)
+        burn_out = now + (mass - self.rocket.dry_mass) / flow
+        end, thrust, flow, mass = (np.array([value]) for value in (burn_out, burn.thrust, flow, mass))
+        return RemainingAscent(now, obs[:6], end, thrust, flow, mass, *self.target)
+
+    def _solve(self, jobs):
+        """What `replan_one` returns of each job, in their order."""
+        if not self.pool:
+            return map(replan_one, jobs)
+        chunk = -(-len(jobs) // (2 * self.processes)) or 1
+        return self.pool.map(replan_one, jobs, chunksize=chunk)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The bound: the optimum of each flight's own vehicle and air
+# The optimum of each flight's own vehicle and air: it knows the draw
 # ---------------------------------------------------------------------------------------------------------------------
 
-BOUND_SEGMENTS = 40  # of collocation: the nominal optimum's mass is then within 1e-4 kg of 80
+DRAWN_SEGMENTS = 40  # of collocation: the nominal optimum's mass is then within 1e-4 kg of 80
 
 
-def drawn_rest(rocket: Rocket, dispersion: float, z, orbit) -> Rest:
+def drawn_ascent(rocket: Rocket, dispersion: float, z, orbit) -> RemainingAscent:
     """All of the ascent of the vehicle and air drawn by z (k,), to the orbit (h, e)."""
-    vehicle = envs.draw_vehicles(rocket, dispersion, np.asarray(z)[None])
+    vehicle = draw_vehicles(rocket, dispersion, np.asarray(z)[None])
     end = np.append(vehicle.end[: len(rocket.burns) - 1, 0], vehicle.burn_out)
     thrust, flow, dropped = (column[: len(end), 0] for column in (vehicle.thrust, vehicle.flow, vehicle.dropped))
     lost = flow * np.diff(end, prepend=0.0) + dropped
     mass = vehicle.mass[0] - np.append(0.0, np.cumsum(lost)[:-1])
     air = (vehicle.drag[0], *vehicle.wind[:, 0])
-    return Rest(0.0, rocket.x0[:6], end, thrust, flow, mass, *orbit, air)
+    return RemainingAscent(0.0, rocket.x0[:6], end, thrust, flow, mass, *orbit, air)
 
 
-def bound_one(task):
-    """The optimum of one flight, None where IPOPT finds none: task is (rocket, dispersion, z, orbit, guess)."""
-    rocket, dispersion, z, orbit, guess = task
+def solve_drawn(job):
+    """The optimum of one flight, None where IPOPT finds none: job is (rocket, dispersion, z, orbit, guess)."""
+    rocket, dispersion, z, orbit, guess = job
     ends = np.append([burn.end for burn in rocket.burns[:-1]], guess["t"][-1])
     parts = np.diff(ends, prepend=0.0) / ends[-1]
-    intervals = tuple(max(round(BOUND_SEGMENTS * part), 1) for part in parts)
+    intervals = tuple(max(round(DRAWN_SEGMENTS * part), 1) for part in parts)
     try:
-        return optimise_rest(rocket, drawn_rest(rocket, dispersion, z, orbit), guess, intervals)
+        return optimise_remaining(rocket, drawn_ascent(rocket, dispersion, z, orbit), guess, intervals)
     except NoOptimum:
         return None
 
 
 def drawn_optima(env_id: str, dispersion: float, z, reached=None, processes: int = 1) -> list:
-    """The optima that know their draws z (n, k): what `optimise_rest` returns, None where IPOPT finds none.
+    """The optima that know their draws z (n, k): what `optimise_remaining` returns, None where IPOPT finds none.
 
-    To the target, or to the orbits of the states `reached` (n, 6 or more). What is left of the mass is a bound for
-    every law that ends on that orbit, whatever it knows.
+    To the target, or to the orbits of the states `reached` (n, 6 or more). No guidance law that ends on that orbit
+    has more mass left, whatever it knows.
     """
-    rocket, guess = envs.ROCKETS[env_id].rocket, optimum_guess(env_id)
-    orbits = [envs.target_orbit(rocket.target, rocket.mu)] * len(z)
+    rocket, guess = ROCKETS[env_id].rocket, optimum_guess(env_id)
+    orbits = [target_orbit(rocket.target, rocket.mu)] * len(z)
     if reached is not None:
-        orbits = [tuple(np.array(vector) for vector in envs.orbit_vectors(y, rocket.mu)) for y in reached]
-    tasks = [(rocket, dispersion, row, orbit, guess) for row, orbit in zip(z, orbits)]
+        orbits = [tuple(np.array(vector) for vector in orbit_vectors(y, rocket.mu)) for y in reached]
+    jobs = [(rocket, dispersion, row, orbit, guess) for row, orbit in zip(z, orbits)]
     if processes == 1:
-        return [bound_one(task) for task in tasks]
+        return [solve_drawn(job) for job in jobs]
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
-        return list(pool.map(bound_one, tasks, chunksize=-(-len(tasks) // (4 * processes))))
+        return list(pool.map(solve_drawn, jobs, chunksize=-(-len(jobs) // (4 * processes))))
 
 
 def fly_optima(env_id: str, optima: list):
-    """The law that flies each of the m flights by its own optimum, open loop, and the nominal one where that is None.
+    """The guidance that flies each of the m flights by its own optimum, open loop, by the nominal one where it is None.
 
-    It knows the draw: it is flown to see that the bound can be reached.
+    It knows the draw: it is flown to see that the optima's mass can be reached.
     """
-    nominal, times = replay(env_id), middles(envs.ROCKETS[env_id].rocket)
-    u = [held(optimum, times) if optimum else None for optimum in optima]
+    nominal, times = open_loop(env_id), middles(ROCKETS[env_id].rocket)
+    u = [directions_at(optimum, times) if optimum else None for optimum in optima]
 
     def policy(obs, t):
         actions = nominal(obs, t)

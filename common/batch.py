@@ -1,7 +1,4 @@
-"""What every environment shares: the Runge-Kutta step, the batch of N flights, the single environment as a view of it.
-
-`envs.py` (double integrator, Van der Pol) and `rocket_env.py` build on it; every name here is also one of `envs`.
-"""
+"""What every environment shares: the batch of N flights, and the single environment as a view of a batch of one."""
 
 from __future__ import annotations
 
@@ -14,23 +11,9 @@ from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from rocket import BadInput
+from common.errors import BadInput
 
-
-def rk4(f, x, u, dt):
-    """One classical Runge-Kutta step of x' = f(x, u) with the control held, x a tuple of components.
-
-    The paper's x_{k+1}, "performed using numerical methods such as Runge-Kutta schemes". Exact for the double
-    integrator: its solution is quadratic in dt.
-    """
-    k1 = f(x, u)
-    k2 = f(tuple(xi + 0.5 * dt * ki for xi, ki in zip(x, k1)), u)
-    k3 = f(tuple(xi + 0.5 * dt * ki for xi, ki in zip(x, k2)), u)
-    k4 = f(tuple(xi + dt * ki for xi, ki in zip(x, k3)), u)
-    return tuple(xi + dt / 6 * (a + 2 * (b + c) + d) for xi, a, b, c, d in zip(x, k1, k2, k3, k4))
-
-
-DRAWN = {"render_modes": ["rgb_array"], "render_fps": 15}
+RENDERED = {"render_modes": ["rgb_array"], "render_fps": 15}
 
 
 class BatchedEnv(VectorEnv):
@@ -39,9 +22,10 @@ class BatchedEnv(VectorEnv):
     A problem gives the spaces, `episode_steps` (the longest episode) and three methods:
     `_start(mask, options)` puts the environments in `mask` at a start, `_observe()` returns (N, obs) float64, and
     `_advance(actions)` flies one step and returns `(rewards (N,), terminated (N,), final)`, where `final()` gives the
-    `final_info` arrays of the finished episodes; it is only called when there is one. One that can be drawn has
-    `DRAWN` in its `metadata` and two more: `_snapshot()` returns time (N,) s, the control of the step before (N, m) and
-    state (N, n), arrays of their own, and `_make_sheet(animation)` the drawing.
+    `final_info` arrays of the finished episodes; it is only called when there is one. One that can be rendered has
+    `RENDERED` in its `metadata` and two more: `_snapshot()` returns time (N,) s, the control of the step before (N, m)
+    and state (N, n), arrays of their own; `_make_sheet()` returns the drawing, whose `frame(t, u, y)` is a flight's
+    picture. `dt` is the step in s, `phase` (N,) the 0-based phase in which the running steps begin.
 
     With the attribute `flights_per_start` G, to be set before a `reset` and only in training, environment k flies start
     k // G, so that flights differ by their actions alone (1: each flies its own start; the last group is smaller where
@@ -133,11 +117,9 @@ class BatchedEnv(VectorEnv):
             return None
         if not self._trails[0]:
             raise ResetNeeded("nothing to render: call reset() first")
-        import animation  # Matplotlib takes a quarter of a second that only a drawing should cost
-
-        self._sheet = self._sheet or self._make_sheet(animation)
+        self._sheet = self._sheet or self._make_sheet()
         columns = [[np.array(column) for column in zip(*trail)] for trail in self._trails]
-        return tuple(self._sheet.frame(animation.Flight(t, u[1:], y)) for t, u, y in columns)
+        return tuple(self._sheet.frame(t, u[1:], y) for t, u, y in columns)
 
     def _draw_starts(self, draw, count):
         """Starts (count, k) of episodes that begin together, each `flights_per_start` in a row; `draw(n)` draws n.

@@ -1,37 +1,30 @@
-"""Reference optima of the rockets in `envs`: one nonlinear program, solved by IPOPT, then flown by the environment.
+"""Reference optima of the rockets: one nonlinear program, solved by IPOPT, then flown by the environment.
 
 Reading order: the program (what is solved, its meshes, collocation, the solve), the references that the environments
-fly. CasADi and SciPy are imported only where they are used: a stored reference needs neither. `baselines.py` has the
-small problems and the command line; every name here is also one of `baselines`.
+fly. CasADi and SciPy are imported only where they are used: a stored reference needs neither.
 """
 
 from __future__ import annotations
 
 import json
-import signal
-import threading
 import time
-import tokenize
 import warnings
-import zlib
-from contextlib import contextmanager
 from dataclasses import replace
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import NamedTuple
-from zipfile import BadZipFile
 
 import numpy as np
 
-import envs
-from envs import ROCKET, ROCKETS, Mission, Rocket, rk4
-
-DAMAGED_NPZ = (ValueError, EOFError, BadZipFile, zlib.error, tokenize.TokenError)  # what np.load raises on one
-
-
-class NoOptimum(RuntimeError):
-    """A reference that was not found, or does not fly as it was solved; its message is one line."""
-
+from common.errors import NoOptimum
+from common.files import DAMAGED_NPZ
+from common.integration import rk4
+from common.ipopt import interruptible
+from rocket.dynamics import ascent
+from rocket.environment import flown_mission, fly_rocket
+from rocket.missions import PAPER_MISSION, ROCKETS, Mission
+from rocket.orbits import local_frame, orbit_vectors, target_axes, target_orbit, terminal_error
+from rocket.vehicle import ROCKET, Rocket, delta_v, launch_raan
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Rocket ascent: one nonlinear program, transcribed by collocation or by the environment's own steps
@@ -42,7 +35,7 @@ MAX_ITERATIONS = 150  # an ascent that exists took 18 to 42; one that does not w
 GAUSS_POINTS = (1 + np.polynomial.legendre.leggauss(4)[0]) / 2  # in (0, 1)
 
 
-class Ascent(NamedTuple):
+class AscentCase(NamedTuple):
     """What is solved: a vehicle, final time free (heaviest) or the table's (least turning), altitude bounds in m."""
 
     key: str
@@ -52,15 +45,15 @@ class Ascent(NamedTuple):
     floor: float = 1.0  # m
 
 
-PAPER_CEILING = envs.PAPER_MISSION.ceiling  # the paper penalises an overshoot; the bound is ours
+PAPER_CEILING = PAPER_MISSION.ceiling  # the paper penalises an overshoot; the bound is ours
 ASCENTS = {
     case.key: case
     for case in (
-        Ascent("free", ROCKET),
-        Ascent("free_table_isp", replace(ROCKET, table_isp=True)),
-        Ascent("fixed", ROCKET, free=False),
-        Ascent("fixed_capped", ROCKET, free=False, ceiling=PAPER_CEILING),
-        Ascent("drag_free", replace(ROCKET, Cd=0.0), floor=5.0),  # else its optimum, held over steps, skims the ground
+        AscentCase("free", ROCKET),
+        AscentCase("free_table_isp", replace(ROCKET, table_isp=True)),
+        AscentCase("fixed", ROCKET, free=False),
+        AscentCase("fixed_capped", ROCKET, free=False, ceiling=PAPER_CEILING),
+        AscentCase("drag_free", replace(ROCKET, Cd=0.0), floor=5.0),  # else its optimum, held, skims the ground
     )
 }
 
@@ -81,7 +74,7 @@ def state_scale(rocket: Rocket):
     return np.repeat([rocket.Re, np.sqrt(rocket.mu / rocket.Re)], 3)
 
 
-def collocation_mesh(case: Ascent, end: float, segments: int) -> Mesh:
+def collocation_mesh(case: AscentCase, end: float, segments: int) -> Mesh:
     """About `segments` intervals of like length, a whole number in each arc; the last arc's stretch with the end."""
     arcs = [arc for arc in case.rocket.arcs() if arc[0] < end]
     start, stop = arcs[-1][0], min(arcs[-1][1], case.rocket.end_time)
@@ -93,7 +86,7 @@ def collocation_mesh(case: Ascent, end: float, segments: int) -> Mesh:
     return Mesh(t, stretch, t_u, np.arange(len(t_u)), (start, stop), len(GAUSS_POINTS))
 
 
-def held_mesh(rocket: Rocket, end: float) -> Mesh:
+def zero_order_hold_mesh(rocket: Rocket, end: float) -> Mesh:
     """The environment's steps until a fixed end, cut at the events, with one direction each."""
     t_u = rocket.dt * np.arange(np.ceil(end / rocket.dt - 1e-9))
     t = np.unique([*t_u, *(arc[1] for arc in rocket.arcs() if arc[1] < end), end])
@@ -123,24 +116,24 @@ def collocation(rocket: Rocket, in_wind: bool = False):
             (*ca.vertsplit(scale * z[:, j]), mass - flow * tau[j] * dt),
             (*ca.vertsplit(u[:, j]), thrust, flow),
         )
-        rates.append(ca.vertcat(*envs.ascent(state, control, rocket, wind or None, drag)[:6]) / scale)
+        rates.append(ca.vertcat(*ascent(state, control, rocket, wind or None, drag)[:6]) / scale)
     nodes = ca.horzcat(x, z)
     defects = nodes @ C - dt * ca.horzcat(*rates)
     parameters = ca.vertcat(*engine, *air)
     return ca.Function("collocation", [x, z, u, parameters], [defects, nodes @ D])
 
 
-def held_step(rocket: Rocket):
-    """Interval of multiple shooting, as `collocation` but without points: the environment's step, direction held."""
+def zero_order_hold_step(rocket: Rocket):
+    """Interval of multiple shooting, as `collocation` but without points: the environment's step, u held."""
     import casadi as ca
 
     scale = ca.DM(state_scale(rocket))
     x, u = ca.SX.sym("x", 6), ca.SX.sym("u", 3)
     mass, thrust, flow, dt = engine = ca.vertsplit(ca.SX.sym("engine", 4))
     state, control = (*ca.vertsplit(scale * x), mass), (*ca.vertsplit(u), thrust, flow)
-    x_next = rk4(lambda x, u: envs.ascent(x, u, rocket), state, control, dt)
+    x_next = rk4(lambda x, u: ascent(x, u, rocket), state, control, dt)
     none = ca.SX(6, 0)
-    return ca.Function("held_step", [x, none, u, ca.vertcat(*engine)], [none, ca.vertcat(*x_next[:6]) / scale])
+    return ca.Function("zoh_step", [x, none, u, ca.vertcat(*engine)], [none, ca.vertcat(*x_next[:6]) / scale])
 
 
 def burning(rocket: Rocket, t):
@@ -158,11 +151,11 @@ def orbit_defect(rocket: Rocket, x, h_target, e_target):
     """
     import casadi as ca
 
-    h, e = (ca.vertcat(*vector) for vector in envs.orbit_vectors(ca.vertsplit(x), rocket.mu))
-    return ca.vertcat((h - h_target) / ca.norm_2(h_target), ca.DM(envs.target_axes(rocket)[:2]) @ (e - e_target))
+    h, e = (ca.vertcat(*vector) for vector in orbit_vectors(ca.vertsplit(x), rocket.mu))
+    return ca.vertcat((h - h_target) / ca.norm_2(h_target), ca.DM(target_axes(rocket)[:2]) @ (e - e_target))
 
 
-def ascent_program(case: Ascent, mesh: Mesh):
+def ascent_program(case: AscentCase, mesh: Mesh):
     """The nonlinear program as CasADi symbols: unknowns x (6, n) at the intervals' ends, z, u (3, m), final time.
 
     Minimises the final time (the mass left falls with it), or sum |u_{k+1} - u_k|^2 where that is fixed. Constraints:
@@ -179,9 +172,9 @@ def ascent_program(case: Ascent, mesh: Mesh):
     engine = ca.vertcat(mass - flow * (t[:-1] - start), thrust, flow, t[1:] - t[:-1])
     x0 = rocket.x0[:6] / scale
     x0[3] += 1e-16  # |v_rel| has no derivative where it is 0, as it is on the ground
-    interval = collocation(rocket) if mesh.points else held_step(rocket)
+    interval = collocation(rocket) if mesh.points else zero_order_hold_step(rocket)
     defects, ends = interval.map(n)(ca.horzcat(x0, x[:, :-1]), z, u[:, mesh.column.tolist()], engine)
-    target = (ca.DM(vector) for vector in envs.target_orbit(rocket.target, rocket.mu))
+    target = (ca.DM(vector) for vector in target_orbit(rocket.target, rocket.mu))
     orbit = orbit_defect(rocket, ca.DM(scale) * x[:, -1], *target)
     constraints = ca.veccat(defects, x - ends, ca.sum1(u**2) - 1, orbit, ca.sqrt(ca.sum1(x[:3, :] ** 2)))
     cost = end / (scale[0] / scale[3]) if case.free else ca.sumsqr(u[:, 1:] - u[:, :-1])
@@ -193,48 +186,8 @@ def interpolate(times, t, values):
     return np.column_stack([np.interp(times, t, column) for column in values.T])
 
 
-@contextmanager
-def interruptible():
-    """Raise at the block's end what a handler of SIGINT or SIGTERM raised within it, even where CasADi swallowed it.
-
-    That is KeyboardInterrupt by default. CasADi takes it for one more failure of IPOPT, returns nothing, raises a
-    RuntimeError, or, where it tries an argument's types, passes over it.
-    """
-    raised: list[BaseException] = []
-    within = True  # a signal that comes while the handlers are put back waits for that
-
-    def noted(handler):
-        def note(signum, frame):
-            try:
-                handler(signum, frame)
-            except BaseException as error:
-                raised.append(error)
-                if within:
-                    raise
-
-        return note
-
-    handlers = {}
-    if threading.current_thread() is threading.main_thread():  # the only one that signals reach
-        handlers = {signum: signal.getsignal(signum) for signum in (signal.SIGINT, signal.SIGTERM)}
-        handlers = {signum: handler for signum, handler in handlers.items() if callable(handler)}
-    try:
-        for signum, handler in handlers.items():
-            signal.signal(signum, noted(handler))
-        yield
-    except Exception:
-        if not raised:
-            raise
-    finally:
-        within = False
-        for signum, handler in handlers.items():
-            signal.signal(signum, handler)
-    if raised:
-        raise raised[0]
-
-
 @interruptible()
-def ascend(case: Ascent, mesh: Mesh, guess: dict) -> dict:
+def ascend(case: AscentCase, mesh: Mesh, guess: dict) -> dict:
     """Solve `ascent_program` from a guess with t (s), y (its states, at least r and v), t_u (s), u (directions).
 
     Returns the same of the optimum (y (n+1, 6)), `status`, `final_time`, `final_mass`, and `costate` (m, 3), the
@@ -275,18 +228,18 @@ def ascend(case: Ascent, mesh: Mesh, guess: dict) -> dict:
 
 FIXED, CUTOFF = "RocketAscent-v0", "RocketAscentCutoff-v0"
 STORED = {CUTOFF: "free", FIXED: "fixed_capped"}  # the keys of the paper's references; any other's is its id
-RESULTS = Path(__file__).parent / "results"
+RESULTS = Path(__file__).parents[1] / "results"
 MISS_TOLERANCE = 2e-5  # terminal error of a stored reference in flight, unless it flew worse when it was solved
-HELD_TOLERANCE = 2e-4  # of a solve's: directions held over steps cost more where a rocket accelerates harder
+HOLD_TOLERANCE = 2e-4  # of a solve's: directions held over steps cost more where a rocket accelerates harder
 IN_PLANE = 1e-3  # rad, below which an optimum's yaw is the solver's rounding
 
 
-def mission_ascent(key: str, mission: Mission) -> Ascent:
+def mission_case(key: str, mission: Mission) -> AscentCase:
     """What a mission's policy is measured against: with cut-off the heaviest, else the least turning below its ceiling.
 
     With free time no ceiling is imposed: what is left of the mass is then a bound for every flight.
     """
-    return Ascent(key, mission.rocket, mission.cutoff, np.inf if mission.cutoff else mission.ceiling)
+    return AscentCase(key, mission.rocket, mission.cutoff, np.inf if mission.cutoff else mission.ceiling)
 
 
 def ascent_guesses(rocket: Rocket) -> list[tuple[float, float]]:
@@ -314,18 +267,18 @@ def pitch_times(rocket: Rocket, end: float):
 
 
 def fly_directions(env_id: str, rocket: Rocket, u, end: float) -> dict:
-    """`envs.fly_rocket` of the directions u (K, 3) in ECI, held over the steps until `end` (s)."""
-    return envs.fly_rocket(env_id, lambda obs, k: u[k, None], end_time=end, rocket=rocket)
+    """`fly_rocket` of the directions u (K, 3) in ECI, held over the steps until `end` (s)."""
+    return fly_rocket(env_id, lambda obs, k: u[k, None], end_time=end, rocket=rocket)
 
 
 def fly_angles(env_id: str, pitch, yaw, end: float, **options) -> dict:
-    """`envs.fly_rocket` at the angles `pitch` above the horizon and `yaw` out of the target's plane, (K,) rad each."""
+    """`fly_rocket` at the angles `pitch` above the horizon and `yaw` out of the target's plane, (K,) rad each."""
     ahead = np.cos(yaw)
     u = np.stack([np.sin(pitch) * ahead, np.cos(pitch) * ahead, np.sin(yaw)], axis=1)
-    return envs.fly_rocket(env_id, lambda obs, k: u[k, None], end_time=end, action_frame="local", **options)
+    return fly_rocket(env_id, lambda obs, k: u[k, None], end_time=end, action_frame="local", **options)
 
 
-def cold_start(case: Ascent, end: float, tilt_time: float) -> dict:
+def cold_start(case: AscentCase, end: float, tilt_time: float) -> dict:
     """The guess: a flight that tilts evenly from straight up to the horizon and stays there."""
     t = case.rocket.dt * np.arange(np.ceil(end / case.rocket.dt))
     pitch = np.pi / 2 * np.clip(1 - t / tilt_time, 0.0, 1.0)
@@ -333,17 +286,17 @@ def cold_start(case: Ascent, end: float, tilt_time: float) -> dict:
     return flight | {"t_u": flight["t"][:-1]}
 
 
-def refuse_too_weak(case: Ascent):
+def refuse_too_weak(case: AscentCase):
     """RuntimeError where all the delta-v at once, on the ground and eastwards, has not the target's energy."""
     rocket = case.rocket
-    speed = envs.delta_v(rocket) + np.linalg.norm(rocket.x0[3:6])
+    speed = delta_v(rocket) + np.linalg.norm(rocket.x0[3:6])
     if speed**2 / 2 - rocket.mu / rocket.Re < rocket.target_energy:
         needs = np.sqrt(2 * (rocket.target_energy + rocket.mu / rocket.Re))
         has = f"delta-v and the Earth's turning are {speed:.0f} m/s, its orbit needs {needs:.0f} m/s and losses"
         raise NoOptimum(f"rocket ascent {case.key}: {has}; look at its payload, {rocket.payload} kg")
 
 
-def optimise_ascent(case: Ascent, segments: int = SEGMENTS) -> dict:
+def optimise_ascent(case: AscentCase, segments: int = SEGMENTS) -> dict:
     """The optimum from the first of `ascent_guesses` that IPOPT takes there: what `ascend` returns.
 
     With free final time by direct collocation, else by the environment's own steps. Raises RuntimeError that says what
@@ -353,13 +306,13 @@ def optimise_ascent(case: Ascent, segments: int = SEGMENTS) -> dict:
     refuse_too_weak(case)
     for end, tilt_time in ascent_guesses(rocket):
         end = end if case.free else rocket.end_time
-        mesh = collocation_mesh(case, end, segments) if case.free else held_mesh(rocket, end)
+        mesh = collocation_mesh(case, end, segments) if case.free else zero_order_hold_mesh(rocket, end)
         try:
             return ascend(case, mesh, cold_start(case, end, tilt_time))
         except NoOptimum as error:
             failure = error
-    launch_raan = envs.launch_raan(rocket.latitude, rocket.i)
-    plane = f"the launch site's plane at t = 0 has -arcsin(tan latitude / tan i) = {launch_raan:.4f}"
+    launch_plane = launch_raan(rocket.latitude, rocket.i)
+    plane = f"the launch site's plane at t = 0 has -arcsin(tan latitude / tan i) = {launch_plane:.4f}"
     look = f"look at its raan, {rocket.raan:.8g} degrees ({plane}), its payload, {rocket.payload} kg, its i, {rocket.i}"
     look += f", and its end_time, {rocket.end_time} s"
     look += f", below {case.ceiling / 1e3:g} km" if np.isfinite(case.ceiling) else ""
@@ -376,19 +329,19 @@ def reached_optimum(flight: dict, rocket: Rocket = ROCKET) -> dict:
     with warnings.catch_warnings():  # an inclination that misses the launch latitude by a hair is no dog-leg
         warnings.simplefilter("ignore")
         rocket = replace(rocket, a=1e3 * float(flight["a_km"]), e=float(flight["e"]), **angles)
-        return optimise_ascent(Ascent("reached", rocket))
+        return optimise_ascent(AscentCase("reached", rocket))
 
 
 def nine_pitch_angles(env_id: str, flight: dict, rocket: Rocket) -> dict:
     """The opponent: a cubic spline through a flight's pitch at nine times (`pitch_times`), flown without feedback.
 
     Where the flight steers out of the target's plane by more than `IN_PLANE`, its yaw at these times, too. Returns what
-    `envs.fly_rocket` does. The times are ours: close together where the pitch turns fast.
+    `fly_rocket` does. The times are ours: close together where the pitch turns fast.
     """
     from scipy.interpolate import CubicSpline
 
     t, u = flight["t"], flight["u"].T
-    frame = envs.local_frame(flight["y"][:-1].T, envs.target_axes(rocket)[2])
+    frame = local_frame(flight["y"][:-1].T, target_axes(rocket)[2])
     up, along, cross = ((u * axis).sum(axis=0) for axis in frame)
     pitch, yaw, middle = np.arctan2(up, along), np.arcsin(np.clip(cross, -1, 1)), (t[:-1] + t[1:]) / 2
     knots = pitch_times(rocket, t[-1])
@@ -399,11 +352,11 @@ def nine_pitch_angles(env_id: str, flight: dict, rocket: Rocket) -> dict:
 
 
 @cache
-def solve_ascent(case: Ascent):
+def solve_ascent(case: AscentCase):
     """One ascent: its numbers, its flight by the environment, and the collocation (None if the time is fixed).
 
     With free final time the collocation's directions at mid-step are held over the environment's steps; with fixed time
-    the program has these steps itself. Raises RuntimeError where the flight misses by more than `HELD_TOLERANCE`.
+    the program has these steps itself. Raises RuntimeError where the flight misses by more than `HOLD_TOLERANCE`.
     """
     from scipy.interpolate import CubicSpline
 
@@ -417,44 +370,68 @@ def solve_ascent(case: Ascent):
         directions = solution["u"]
     seconds = time.perf_counter() - begin
     flight = fly_directions(FIXED, rocket, directions, solution["final_time"])
-    if not flight["error_norm"] <= HELD_TOLERANCE:
+    if not flight["error_norm"] <= HOLD_TOLERANCE:
         raise NoOptimum(f"rocket ascent {case.key}: flown by the environment it misses by {flight['error_norm']}")
     numbers = {"final_mass_kg": solution["final_mass"], "final_time_s": solution["final_time"]}
-    numbers |= {"error_norm": np.linalg.norm(envs.terminal_error(solution["y"][-1], rocket))}
+    numbers |= {"error_norm": np.linalg.norm(terminal_error(solution["y"][-1], rocket))}
     numbers |= {f"replay_{name}": flight[name] for name in ("error_norm", "final_mass_kg", "final_time_s")}
     numbers |= {"turning": (np.diff(flight["u"], axis=0) ** 2).sum(), "max_altitude_km": flight["max_altitude_km"]}
     numbers |= {"solve_seconds": seconds, "status": solution["status"]}
     return {name: value if name == "status" else float(value) for name, value in numbers.items()}, flight, optimum
 
 
-def rocket_reference(env_id: str, **options) -> dict:
-    """The reference of an environment id, flown by it: what `envs.fly_rocket` returns, and three numbers beside it.
+def reference_case(env_id: str, mission: Mission) -> AscentCase:
+    """What `rocket_reference` solves; its key is the one under which results/ may hold it."""
+    key = STORED.get(env_id, env_id)
+    case = mission_case(key, mission)
+    has_other_rules = key in ASCENTS and case != ASCENTS[key]  # neither the paper's rocket nor its ceiling
+    return case._replace(key=env_id) if has_other_rules else case
 
-    `reference_mass_kg` and `reference_time_s` of the solve (see `mission_ascent`), `nine_pitch_error_norm` of
+
+def rocket_reference(env_id: str, **options) -> dict:
+    """The reference of an environment id, flown by it: what `fly_rocket` returns, and three numbers beside it.
+
+    `reference_mass_kg` and `reference_time_s` of the solve (see `mission_case`), `nine_pitch_error_norm` of
     `nine_pitch_angles`. `options` of the environment, `rocket` and `table_isp`, change what is solved. Read from
     results/rocket_reference.{json,npz} where it is there and still reaches the target, else solved, with CasADi.
-    Raises ValueError on an unknown id, RuntimeError where a solve fails.
+    Raises ValueError on an unknown id, NoOptimum where a solve fails.
     """
     if env_id not in ROCKETS:
         raise ValueError(f"env_id is {env_id!r}; it must be one of {', '.join(ROCKETS)}")
-    mission, key = envs.flown_mission(ROCKETS[env_id], **options), STORED.get(env_id, env_id)
-    rocket, case = mission.rocket, mission_ascent(key, mission)
-    if case != ASCENTS.get(key, case):  # the id, but neither the paper's rocket nor its ceiling
-        key, case = env_id, case._replace(key=env_id)
+    return mission_reference(env_id, flown_mission(ROCKETS[env_id], **options))
+
+
+def mission_reference(env_id: str, mission: Mission) -> dict:
+    """`rocket_reference` of a mission, which need not be the one that the id is registered for."""
+    case = reference_case(env_id, mission)
+    found = stored_reference(env_id, case) if mission == ROCKETS[env_id] else None
+    if found is None:
+        numbers, solved, _ = solve_ascent(case)
+        found = numbers, fly_directions(env_id, case.rocket, solved["u"], solved["t"][-1])
+    numbers, flight = found
+    return flight | {
+        "reference_mass_kg": numbers["final_mass_kg"],
+        "reference_time_s": numbers["final_time_s"],
+        "nine_pitch_error_norm": nine_pitch_angles(env_id, flight, case.rocket)["error_norm"],
+    }
+
+
+kept_reference = lru_cache(maxsize=4)(mission_reference)  # evaluations during a training fly it again and again
+
+
+def stored_reference(env_id: str, case: AscentCase) -> tuple[dict, dict] | None:
+    """The numbers of a solve in results/ and its flight by the environment; None where none fits the case any more."""
+    rocket = case.rocket
     try:
-        numbers, u, end = stored_ascent(key)
+        numbers, u, end = stored_ascent(case.key)
         flight = fly_directions(env_id, rocket, u, end)
-        stale = not flight["error_norm"] <= max(MISS_TOLERANCE, 1.01 * numbers["replay_error_norm"])
-        stale |= case.free != (end < rocket.end_time - 1e-6)  # solved before the mission's rules were changed
-        stale |= flight["max_altitude_km"] > case.ceiling / 1e3 + 0.5
     except (OSError, LookupError, TypeError, *DAMAGED_NPZ):
-        stale = True
-    if stale or mission != ROCKETS[env_id]:
-        numbers, flight, _ = solve_ascent(case)
-        flight = fly_directions(env_id, rocket, flight["u"], flight["t"][-1])
-    opponent = nine_pitch_angles(env_id, flight, rocket)["error_norm"]
-    mass, end_time = numbers["final_mass_kg"], numbers["final_time_s"]
-    return flight | {"reference_mass_kg": mass, "reference_time_s": end_time, "nine_pitch_error_norm": opponent}
+        return None
+    reaches_target = flight["error_norm"] <= max(MISS_TOLERANCE, 1.01 * numbers["replay_error_norm"])
+    is_cut_off = end < rocket.end_time - 1e-6
+    below_ceiling = not flight["max_altitude_km"] > case.ceiling / 1e3 + 0.5
+    fits = reaches_target and is_cut_off == case.free and below_ceiling
+    return (numbers, flight) if fits else None
 
 
 def stored_ascent(key: str):

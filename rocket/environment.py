@@ -1,55 +1,78 @@
-"""The rockets' environment: time grid, events, RK4, cut-off, dispersed vehicles. `rocket.py` is best read before it.
-
-Every name here is also one of `envs`, which registers the ids.
-"""
+"""The rockets' environment: time grid, events, RK4, cut-off, dispersed vehicles; and how an id is registered."""
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.envs.registration import ENV_ID_RE
 from gymnasium.spaces import Box
 
-from batched import DRAWN, BatchedEnv, SingleEnv, of_batch, rk4
-from rocket import (
+from common.batch import RENDERED, BatchedEnv, SingleEnv, of_batch
+from common.errors import BadInput, refuse_unless
+from common.integration import rk4
+from rocket.dispersion import (
     DISPERSION,
     LARGEST_DISPERSION,
-    PAPER_MISSION,
-    REFERENCE_PITCH,
-    ROCKETS,
-    TERMINAL_SCALE,
-    BadInput,
-    Mission,
-    Rocket,
-    ascent,
     check_drawable,
-    delta_v,
     draw_bounds,
     draw_names,
     draw_vehicles,
-    guidance_reward,
     largest_draw,
-    local_frame,
     nominal_vehicles,
+)
+from rocket.dynamics import ascent
+from rocket.missions import PAPER_MISSION, ROCKETS, Mission
+from rocket.orbits import (
+    local_frame,
     orbit_vectors,
     orbital_elements,
-    orbital_reward,
-    penalties,
-    precision_points,
-    refuse_unless,
     specific_energy,
     target_axes,
     target_orbit,
     terminal_error,
+)
+from rocket.rewards import (
+    REFERENCE_PITCH,
+    TERMINAL_SCALE,
+    guidance_reward,
+    orbital_reward,
+    penalties,
+    precision_points,
     terminal_reward,
     trajectory_reward,
 )
+from rocket.vehicle import Rocket, delta_v
 
 ACTION_FRAMES = ("eci", "local")
 STIFF = 0.25  # drag's derivative by the speed, rho Cd S |v| / m, times the step: from here on a step is cut
+
+
+class Schedule(NamedTuple):
+    """When steps are flown, (N,) each."""
+
+    begin: np.ndarray  # s
+    end: np.ndarray  # s
+    phi: np.ndarray  # the phase before the step, 0 to 1
+    arc: np.ndarray  # in which the step begins, an index of `Vehicles`' arcs
+
+
+class Steps(NamedTuple):
+    """The steps that n environments are flying."""
+
+    u: np.ndarray  # (3, n) thrust directions in ECI, held
+    begin: np.ndarray  # (n,) s: of the step, or of the arc that has begun within it
+    end: np.ndarray  # (n,) s, of the whole step
+    who: np.ndarray  # (n,) the environments
+    arc: np.ndarray  # (n,) the arc at `begin`
+
+    def of(self, chosen) -> Steps:
+        """Those of some of them."""
+        return Steps(*(column[..., chosen] for column in self))
 
 
 class RocketVectorEnv(BatchedEnv):
@@ -87,7 +110,7 @@ class RocketVectorEnv(BatchedEnv):
     phase's end).
     """
 
-    metadata = {**BatchedEnv.metadata, **DRAWN}
+    metadata = {**BatchedEnv.metadata, **RENDERED}
     PARTS = ("R_orbital", "R_trajectory", "R_guidance", "R_penalties", "R_terminal")
 
     def __init__(
@@ -241,28 +264,35 @@ class RocketVectorEnv(BatchedEnv):
             obs[:, 9:] = self.draw
         if self.dispersion and not self.observe_mass:
             obs[:, 6] = self._computed_mass()
-        (*_, phi), _ = self._schedule()
+        phi = self._schedule().phi
         obs[:, 7] = (1 - self.time / self.rocket.end_time) * self.observe_phase
         obs[:, 8] = phi * self.observe_phase
         return obs
 
-    def _schedule(self):
-        """Of the running steps, as `_work_out` has it."""
+    @property
+    def dt(self) -> float:
+        """The step in s."""
+        return self.rocket.dt
+
+    @property
+    def phase(self) -> np.ndarray:
+        """The 0-based phase (N,) in which the running steps begin: a burn is a phase."""
+        return np.minimum(self._schedule().arc, self._last_phase)
+
+    def _schedule(self) -> Schedule:
+        """Of the running steps."""
         if self._table is None:
             return self._work_out(self.t, self.vehicles)
-        clock, arc = self._table
-        return clock[:, self.t], arc[self.t]
+        return Schedule(*(column[self.t] for column in self._table))
 
-    def _work_out(self, t, vehicles):
-        """Begin and end (s) of the steps t (N,) and the phase phi before them, (3, N); the arcs they begin in, (N,).
-
-        After an episode's last step phi is still that one's.
-        """
+    def _work_out(self, t, vehicles) -> Schedule:
+        """Of the steps t (N,) of these vehicles. After an episode's last step phi is still that one's."""
         dt, ends = self.rocket.dt, vehicles.end
-        time, end = (np.where(k >= self._steps, self._latest, dt * k) for k in (t, t + 1))
+        begin = np.where(t >= self._steps, self._latest, dt * t)
+        end = np.where(t + 1 >= self._steps, self._latest, dt * (t + 1))
         arc = (ends <= dt * np.minimum(t, self._steps - 1)).sum(axis=0)
         phi = np.minimum(arc, self._last_phase) / max(self._last_phase, 1)
-        return np.array([time, end, phi]), arc
+        return Schedule(begin, end, phi, arc)
 
     def _computed_mass(self):
         """The flight computer's mass (N,) in kg: the nominal burn's, counted from the staging that has just been."""
@@ -285,15 +315,16 @@ class RocketVectorEnv(BatchedEnv):
 
     def _advance(self, actions):
         t, u, before = self.t, self._directions(actions), self.y
-        (begin, end, _), arc = self._schedule()
+        begin, end, _, arc = self._schedule()
         duration, phase, done = end - begin, np.minimum(arc, self._last_phase), t + 1 == self._steps
-        self.y = self._fly(before, u, begin, end, duration, self._everyone, arc)
+        steps = Steps(u, begin, end, self._everyone, arc)
+        self.y = self._fly(before, steps, duration)
         if self.cutoff:
             energy = specific_energy(self.y, self.rocket.mu)
             reached = (phase == self._last_phase) & (energy >= self.rocket.target_energy)
             if reached.any():
-                step = before, u, begin, end, duration, self._everyone, arc
-                self.y[:, reached], duration[reached] = self._cut(*(part[..., reached] for part in step))
+                cut = self._cut_off(before[:, reached], self.y[:, reached], steps.of(reached), duration[reached])
+                self.y[:, reached], duration[reached] = cut
             done = done | reached
         altitude = np.sqrt((self.y[:3] ** 2).sum(axis=0)) - self.rocket.Re
         self._crashed = altitude < 0
@@ -304,32 +335,36 @@ class RocketVectorEnv(BatchedEnv):
         self.u, self.t = u, t + 1
         return rewards, done, self._final_info
 
-    def _fly(self, y, u, begin, end, duration, who, arc):
-        """States (7, n) `duration` (n,) s after `begin` (n,) of steps that end at `end` (n,), u (3, n) held.
+    def _fly(self, y, steps, duration):
+        """States (7, n) `duration` (n,) s after the begin of these steps, whose states y (7, n) were then.
 
-        y (7, n): the states at `begin` of the environments `who` (n,), which are then in the arcs `arc` (n,).
+        From event to event: a round flies everyone to the next event or to the end of the duration, then those whom the
+        event has met go on in the arc behind it.
         """
-        event = self.vehicles.end[arc, who]
-        until = event - begin
-        thrust, flow = self.vehicles.thrust[arc, who], self.vehicles.flow[arc, who]
-        y = self._arc(y, u, np.minimum(duration, until), who, thrust, flow)
-        passed = np.flatnonzero(event <= end)
-        if len(passed):
+        flown = np.empty_like(y)
+        flying = np.arange(y.shape[1])  # columns of `flown`
+        while True:
+            event = self.vehicles.end[steps.arc, steps.who]
+            until_event = event - steps.begin
+            y = self._fly_arc(y, steps, np.minimum(duration, until_event))
+            flown[:, flying] = y
             # a duration is rounded: an event at the step's very end, which the next step takes as past, is not missed
-            passed = passed[(duration >= until - 1e-9)[passed]]
-            u, end, who, arc = u[:, passed], end[passed], who[passed], arc[passed]
-            y[6, passed] -= self.vehicles.dropped[arc, who]
-            late = np.maximum((duration - until)[passed], 0.0)
-            y[:, passed] = self._fly(y[:, passed], u, event[passed], end, late, who, arc + 1)
-        return y
+            met = np.flatnonzero((event <= steps.end) & (duration >= until_event - 1e-9))
+            if not len(met):
+                return flown
+            y, flying = y[:, met], flying[met]
+            y[6] -= self.vehicles.dropped[steps.arc[met], steps.who[met]]
+            duration = np.maximum((duration - until_event)[met], 0.0)
+            steps = steps.of(met)._replace(begin=event[met], arc=steps.arc[met] + 1)
 
-    def _arc(self, y, u, dt, who, thrust, flow):
+    def _fly_arc(self, y, steps, dt):
         """States (7, n) after dt (n,) seconds without an event: one RK4 step, several for a plunge into dense air.
 
         There drag is stiff: its rate times the step, at the lowest altitude that the step can reach, is kept below
         `STIFF`. No ascent comes near it; without this a crash at orbital speed would end in numbers without meaning.
         """
-        rocket, controls = self.rocket, (*u, thrust, flow)
+        rocket, (arc, who) = self.rocket, (steps.arc, steps.who)
+        controls = (*steps.u, self.vehicles.thrust[arc, who], self.vehicles.flow[arc, who])
         drag, wind = (self.vehicles.drag[who], self.vehicles.wind[:, who]) if self.dispersion else (None, None)
         # the state as one component (7, n): rk4 then takes a seventh of the array operations
         f = lambda x, u: (np.array(ascent(x[0], u, rocket, wind, drag)),)  # noqa: E731
@@ -351,24 +386,32 @@ class RocketVectorEnv(BatchedEnv):
             y_next[:, stiff] = y_sub
         return y_next
 
-    def _cut(self, before, u, begin, end, duration, who, arc):
-        """States (7, n) and times (n,) within the step at which `who` reach the target's energy; the rest as `_fly`'s.
+    def _cut_off(self, before, after, steps, duration):
+        """States (7, n) and times (n,), s after the begin of these steps, at which the energy is the target's.
 
-        Regula falsi with the Illinois change (Dowell and Jarratt, 1971). The energy grows almost linearly in a step, so
-        that four evaluations reach rounding; six, for all alike, keep a row independent of the rest of the batch.
+        before, after (7, n): the states at the begin and `duration` (n,) s later, when it is passed. Regula falsi with
+        the Illinois change (Dowell and Jarratt, 1971): where the same end of the bracket is replaced twice, the other
+        end's value is halved. The energy grows almost linearly in a step, so that four evaluations reach rounding; six,
+        for all alike, keep a row independent of the rest of the batch.
         """
-        goal = self.rocket.target_energy
-        low, high, above = np.zeros(len(who)), duration, np.full(len(who), -1)
-        f_low = np.minimum(specific_energy(before, self.rocket.mu) - goal, -1e-300)  # beyond it at the start: cut there
-        f_high = specific_energy(self.y[:, who], self.rocket.mu) - goal
+
+        def excess(y):
+            return specific_energy(y, self.rocket.mu) - self.rocket.target_energy
+
+        low, high = np.zeros(len(duration)), duration
+        f_low = np.minimum(excess(before), -1e-300)  # who is beyond it at the begin is cut off there
+        f_high = excess(after)
+        replaced_high = np.full(len(duration), -1)  # whether the last round replaced `high`; -1: there was none
+        y, time = after, duration
         for _ in range(6):
             time = low - f_low * (high - low) / (f_high - f_low)
-            y = self._fly(before, u, begin, end, time, who, arc)
-            f, above_before = specific_energy(y, self.rocket.mu) - goal, above
+            y = self._fly(before, steps, time)
+            f = excess(y)
             above = f >= 0
-            kept = above == above_before  # the same end twice: its value is halved
-            f_low, f_high = np.where(above, f_low / (1 + kept), f), np.where(above, f, f_high / (1 + kept))
+            divisor = 1 + (above == replaced_high)
+            f_low, f_high = np.where(above, f_low / divisor, f), np.where(above, f, f_high / divisor)
             low, high = np.where(above, low, time), np.where(above, time, high)
+            replaced_high = above
         return y, time
 
     def _reward(self, before, u, phase, altitude, done):
@@ -412,8 +455,13 @@ class RocketVectorEnv(BatchedEnv):
     def _snapshot(self):
         return self.time.copy(), self.u.T.copy(), self.y.T.copy()
 
-    def _make_sheet(self, animation):
-        return animation.Ascent(self.rocket, "Rocket ascent" + ", nominal stagings marked" * (self.dispersion > 0))
+    def _make_sheet(self):
+        from rocket.animation import (
+            AscentSheet,  # Matplotlib takes a quarter of a second that only a picture should cost
+        )
+
+        title = "Rocket ascent, nominal stagings marked" if self.dispersion else "Rocket ascent"
+        return AscentSheet(self.rocket, title)
 
 
 def reachable(rocket: Rocket, dispersion: float = 0.0) -> tuple[float, float]:
@@ -486,3 +534,31 @@ def fly_rocket(env_id: str, policy: Callable, end_time: float | None = None, dra
         rewards.append(reward[0])
     final = {key: value[0] for key, value in final.items()}
     return {"t": np.array(t), "u": np.array(u), "y": np.array(y), "reward": np.array(rewards), **final}
+
+
+make_rocket.metadata = RENDERED  # where gym.make looks before there is an environment
+
+
+def register_rocket(env_id: str, rocket: Rocket, cutoff: bool = False, ceiling_km: float | None = None, **rules):
+    """Make a rocket an environment id that references, evaluation, figures and `ppo_gtrxl_rocket.py` take, too.
+
+    `cutoff`, `ceiling_km` and `rules` are the fields of `Mission`. An id that is registered already is replaced, with a
+    warning if it was another rocket's. Raises BadInput where the id is another environment's or not one of Gymnasium's.
+    """
+    others = gym.registry.keys() - ROCKETS.keys()
+    if env_id in others or not ENV_ID_RE.fullmatch(env_id) or "/" in env_id:
+        raise BadInput(f"env_id is {env_id!r}; it must be a new id such as MyRocket-v0")
+    mission = Mission(rocket, cutoff, ceiling_km, **rules)
+    if ROCKETS.get(env_id, mission) != mission:
+        warnings.warn(f"{env_id} was another rocket's id; from here on it is this one's", stacklevel=2)
+    gym.registry.pop(env_id, None)
+    try:
+        gym.register(
+            id=env_id,
+            entry_point="rocket.environment:make_rocket",
+            vector_entry_point="rocket.environment:make_rocket_vector",
+            kwargs={"env_id": env_id},
+        )
+    except gym.error.Error as error:  # the name of another environment without its version
+        raise BadInput(f"env_id is {env_id!r}; it must be a new id such as MyRocket-v0: {error}") from error
+    ROCKETS[env_id] = mission

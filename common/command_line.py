@@ -1,0 +1,55 @@
+"""What the commands have in common: errors of one line, and types of arguments that are checked as they are read."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+
+class OneLineParser(argparse.ArgumentParser):
+    """Errors are one line, without the usage above it."""
+
+    def error(self, message):
+        sys.exit(f"error: {message}")
+
+
+def integer(low: int, high: int) -> Callable:
+    """Argument type: a whole number from `low` to `high`."""
+
+    def parse(text):
+        if not text.isdecimal() or not low <= int(text) <= high:
+            raise argparse.ArgumentTypeError(f"{text!r} must be a whole number from {low} to {high}")
+        return int(text)
+
+    return parse
+
+
+def positive(text: str) -> float:
+    """Argument type: a dispersion that disperses."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value <= 10:
+        raise argparse.ArgumentTypeError(f"{text!r} must be a number above 0, at most 10")
+    return value
+
+
+def output_file(text: str) -> Path:
+    """Argument type: a file to write, refused before anything is solved if that cannot work."""
+    path = Path(text)
+    if path.is_dir() or not os.access(path.parent, os.W_OK):
+        raise argparse.ArgumentTypeError(f"{text!r} must be a file in an existing, writable folder")
+    return path
+
+
+def named_path(text: str) -> tuple[str, Path]:
+    """Argument type: NAME=PATH."""
+    name, _, path = text.partition("=")
+    if not name or not path:
+        raise argparse.ArgumentTypeError(f"{text!r} must be NAME=PATH, a name and an agent.safetensors")
+    return name, Path(path)

@@ -1,0 +1,51 @@
+"""Training curves: {TensorBoard tag: (global steps (k,), values (k,))}."""
+
+from __future__ import annotations
+
+import csv
+
+import numpy as np
+
+from common.files import replacing
+
+
+def read_curve(run_dir) -> dict:
+    """The curve of a run from its TensorBoard events; a resumed run repeats steps, and the last value counts."""
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(run_dir), size_guidance={"scalars": 0})
+    events.Reload()
+    curve = {}
+    for tag in events.Tags()["scalars"]:
+        values = {event.step: event.value for event in events.Scalars(tag)}
+        steps = sorted(values)
+        curve[tag] = np.array(steps), np.array([values[step] for step in steps])
+    return curve
+
+
+def write_csv(path, curve: dict):
+    """Write a curve: `global_step`, then one column a tag; an empty cell where a tag has no value at that step."""
+    columns = {tag: dict(zip(steps.tolist(), values.tolist())) for tag, (steps, values) in curve.items()}
+    with replacing(path, "w") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["global_step", *columns])
+        for step in sorted(set().union(*columns.values())):
+            # TensorBoard keeps float32, which nine digits give back exactly
+            cells = (f"{column[step]:.9g}" if step in column else "" for column in columns.values())
+            writer.writerow([step, *cells])
+
+
+def read_csv(path) -> dict:
+    """The curve that `write_csv` wrote; ValueError if the file is not such a table."""
+    with open(path, newline="") as file:
+        header, *rows = list(csv.reader(file)) or [[]]
+    try:
+        if header[:1] != ["global_step"] or not rows or any(len(row) != len(header) for row in rows):
+            raise ValueError("global_step, then one column a TensorBoard tag, and a row")
+        curve = {}
+        for column, tag in enumerate(header[1:], start=1):
+            filled = [row for row in rows if row[column]]
+            curve[tag] = np.array([int(row[0]) for row in filled]), np.array([float(row[column]) for row in filled])
+    except ValueError as error:
+        raise ValueError(f"{path} is not a training curve: {error}") from error
+    return curve

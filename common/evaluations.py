@@ -1,0 +1,57 @@
+"""The two files of an evaluation, eval.json and eval.npz: written whole, checked when they are read."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+
+from common.files import read_npz, write_json, write_npz
+from common.tasks import env_ids, task_of
+
+
+def sha256_of(path) -> str:
+    """The digest by which an evaluation names its agent.safetensors."""
+    return hashlib.sha256(Path(path).read_bytes()).hexdigest()
+
+
+def write_evaluation(metrics: dict, arrays: dict, checkpoint, json_path, npz_path):
+    """Write an evaluation of the file `checkpoint`, which `metrics` then names by its sha256; None writes nothing."""
+    metrics["checkpoint_sha256"] = sha256_of(checkpoint)
+    if npz_path is not None:
+        write_npz(npz_path, arrays)
+    if json_path is not None:  # last: a run with its eval.json is finished
+        write_json(json_path, metrics)
+
+
+def read_evaluation(folder: Path) -> tuple[dict, dict]:
+    """The `metrics` and `arrays` of a run's or results folder; OSError or ValueError names the file that is bad."""
+    metrics, path = read_metrics(folder / "eval.json"), folder / "eval.npz"
+    arrays = read_npz(path)
+    missing = task_of(metrics["env_id"]).required_arrays(metrics) - arrays.keys()
+    if missing:
+        raise ValueError(f"{path} lacks {', '.join(sorted(missing))}")
+    return metrics, arrays
+
+
+def read_metrics(path: Path) -> dict:
+    """An eval.json that holds all of its table; ValueError names the file and what is wrong with it."""
+    metrics = read_json(path)
+    try:
+        task_of(metrics["env_id"]).table(metrics)
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path} lacks a number of its table, or has a wrong one: {error}") from error
+    return metrics
+
+
+def read_json(path: Path) -> dict:
+    """The eval.json of a finished run; ValueError names the file and what is wrong with it."""
+    try:
+        metrics = json.loads(path.read_text())
+    except ValueError as error:
+        raise ValueError(f"{path} is not readable JSON: {error}") from error
+    if not isinstance(metrics, dict) or metrics.get("env_id") not in env_ids():
+        raise ValueError(f"{path}: env_id must be one of {', '.join(env_ids())}")
+    if not isinstance(metrics.get("seed"), int):
+        raise ValueError(f"{path}: seed is {metrics.get('seed')!r}; it must be an integer")
+    return metrics

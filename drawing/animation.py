@@ -1,0 +1,169 @@
+"""The picture that moves: the sheet that a flight is drawn on, and the GIF.
+
+A family has a `Sheet` of its own, whose `frame` is what `render_mode="rgb_array"` gives; an evaluation's `Animation` is
+a sheet with flights on it. Needs no torch, no ffmpeg: Pillow, on which Matplotlib stands, writes the GIF.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from PIL import Image
+
+from common.errors import BadInput
+from common.files import replacing
+
+WIDTH, HEIGHT, DPI = 800, 450, 100  # pixels of a frame, and of an inch: sizes of text and lines are in points
+SIDES = {"": "policy", "_reference": "optimum"}  # by the suffix of their arrays in eval.npz
+# a flight's head: ours a dot, the optimum's a ring around it
+DOT, LOOKS = (
+    {"linestyle": "", "marker": "o", "zorder": 6},
+    ({"markersize": 4.5}, {"markersize": 7, "fillstyle": "none"}),
+)
+GROWTH = 1.25  # axes grow by this factor, so that a running environment's do not creep
+
+
+class Flight(NamedTuple):
+    """What was flown: times t (K+1,) s, controls u (K, m) held from each time to the next, states y (K+1, n)."""
+
+    t: np.ndarray
+    u: np.ndarray
+    y: np.ndarray
+
+    @classmethod
+    def of(cls, t, u, y, name: str) -> Flight:
+        """The flight of these arrays; BadInput, with its name, if they are not of one flight or hold a NaN."""
+        flight = cls(t, u, y)
+        if not (u.ndim == y.ndim == 2 and len(t) == len(y) == len(u) + 1 > 1):
+            shapes = f"t {t.shape}, u {u.shape}, states {y.shape}"
+            raise BadInput(f"eval.npz: the {name}'s arrays have shapes {shapes}; must be (K+1,), (K, m), (K+1, n)")
+        if not all(np.isfinite(array).all() for array in flight):
+            raise BadInput(f"eval.npz: the {name}'s flight holds a NaN or an infinity; it must be finite")
+        return flight
+
+    def until(self, time: float) -> Flight:
+        """The part up to `time` (s), with the state between two steps on the chord."""
+        if time >= self.t[-1]:
+            return self
+        k = max(int(np.searchsorted(self.t, time, side="right")), 1)  # steps begun
+        part = (time - self.t[k - 1]) / (self.t[k] - self.t[k - 1])
+        y = (1 - part) * self.y[k - 1] + part * self.y[k]
+        return Flight(np.append(self.t[:k], time), self.u[:k], np.vstack([self.y[:k], y]))
+
+
+class Sheet:
+    """A figure of WIDTH x HEIGHT pixels that is drawn again and again; `moving` are the artists that change."""
+
+    def __init__(self, title: str):
+        self.figure = Figure(figsize=(WIDTH / DPI, HEIGHT / DPI), dpi=DPI)
+        self.canvas = FigureCanvasAgg(self.figure)
+        self.figure.text(0.5, 0.955, title, ha="center", fontsize=10)
+        self.moving, self._limits, self._still = [], None, None
+
+    def panel(self, box, title: str = "", **labels):
+        """Axes at `box` (left, bottom, width, height as shares of the sheet), small text, a pale grid."""
+        ax = self.figure.add_axes(box)
+        ax.set(**labels)
+        ax.set_title(title, fontsize=9)
+        ax.tick_params(labelsize=7, length=2)
+        ax.xaxis.label.set_size(8)
+        ax.yaxis.label.set_size(8)
+        ax.grid(alpha=0.3)
+        return ax
+
+    def fit(self, flights: list[Flight]):
+        """Axes that hold all these flights."""
+        raise NotImplementedError
+
+    def show(self, *sides: list[Flight], ended: bool = False):
+        """Draw the flights of each side as far as they go: the policy's, then the optimum's; `pixels` is the frame.
+
+        `ended`: the policy's go no further.
+        """
+        raise NotImplementedError
+
+    def frame(self, t, u, y) -> np.ndarray:
+        """One flight as far as it has come: times t (K+1,), controls u (K, m), states y (K+1, n).
+
+        uint8, (HEIGHT, WIDTH, 3).
+        """
+        flight = Flight(t, u, y)
+        self.fit([flight])
+        self.show([flight])
+        return self.pixels()
+
+    def pixels(self) -> np.ndarray:
+        """The sheet as it is now: uint8, (HEIGHT, WIDTH, 3)."""
+        limits = [(ax.get_xlim(), ax.get_ylim()) for ax in self.figure.axes]
+        if limits != self._limits:  # ticks and text cost most of a drawing: what stands still is drawn once
+            for artist in self.moving:
+                artist.set_animated(True)
+            self.canvas.draw()
+            self._limits, self._still = limits, self.canvas.copy_from_bbox(self.figure.bbox)
+        self.canvas.restore_region(self._still)
+        for artist in sorted(self.moving, key=lambda artist: artist.zorder):
+            self.figure.draw_artist(artist)
+        return np.asarray(self.canvas.buffer_rgba())[..., :3].copy()
+
+
+def room(base: float, values: np.ndarray) -> float:
+    """The smallest base * GROWTH^k, k >= 0, that holds every |value|."""
+    largest = np.abs(values).max(initial=0.0)
+    return base * GROWTH ** max(0, int(np.ceil(np.log(max(largest, base) / base) / np.log(GROWTH) - 1e-9)))
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The GIF
+# ---------------------------------------------------------------------------------------------------------------------
+
+FRAMES, FRAME_MS, HOLD_MS = 130, 80, 2000  # the last frame is held; a GIF counts in hundredths of a second
+COLOURS = 96  # of the palette that all frames share: none flickers, and what stands still costs nothing
+
+
+class Animation(NamedTuple):
+    """A sheet, the flights of policy and optimum on it, and the times (FRAMES,) in s at which the frames show them."""
+
+    sheet: Sheet
+    sides: list[list[Flight]]
+    times: np.ndarray
+
+    @classmethod
+    def of(cls, sheet: Sheet, sides: list[list[Flight]], haste: float = 1.0) -> Animation:
+        """The flights from begin to end; time goes with the power `haste` of the share played."""
+        flights = [flight for side in sides for flight in side]
+        sheet.fit(flights)
+        share = np.linspace(0, 1, FRAMES) ** haste
+        return cls(sheet, sides, share * max(flight.t[-1] for flight in flights))
+
+    def frame(self, k: int) -> np.ndarray:
+        """Frame k: uint8, (HEIGHT, WIDTH, 3)."""
+        time = self.times[k]
+        ended = time >= self.sides[0][0].t[-1]
+        self.sheet.show(*([flight.until(time) for flight in flights] for flights in self.sides), ended=ended)
+        return self.sheet.pixels()
+
+    def write(self, path: Path):
+        """Write it as a GIF."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(path) as file:
+            write_gif(file, self.frame, len(self.times))
+
+
+def write_gif(file, frame, count: int):
+    """Write `count` frames, `frame(k)` each uint8 (H, W, 3), as a GIF that plays for ever."""
+    samples = np.vstack([frame(0), frame(count // 2), frame(count - 1)])
+    palette = Image.fromarray(samples).quantize(COLOURS, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+    first, *others = indexed(frame, count, palette)
+    durations = [FRAME_MS] * (count - 1) + [HOLD_MS]
+    first.save(file, format="GIF", save_all=True, append_images=others, duration=durations, loop=0, disposal=1)
+
+
+def indexed(frame, count: int, palette: Image.Image) -> Iterator[Image.Image]:
+    """The frames in the palette's colours, without dither, one after the other."""
+    for k in range(count):
+        yield Image.fromarray(frame(k)).quantize(palette=palette, dither=Image.Dither.NONE)

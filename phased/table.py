@@ -1,0 +1,71 @@
+"""A small problem's printed table, "optimum | ours | ratio"."""
+
+from __future__ import annotations
+
+from phased.metrics import NEAR_ORIGIN, PAPER_DRAWS, ends_at_origin
+from phased.problem import Problem
+
+
+def table(problem: Problem, metrics: dict) -> str:
+    """The table of an evaluation. The means are over all starts.
+
+    Where some miss a circle, the ratio of J is over the others and its parts have none.
+    """
+    rows = [("", "optimum", "ours", "ratio"), *cost_rows(problem, metrics), *hit_rows(problem, metrics)]
+    width = max(len(label) for label, *_ in rows)
+    lines = [f"{metrics['env_id']}: {metrics['eval_starts']} starts of eval seed {metrics['eval_seed']}"]
+    for label, *cells in rows:
+        line = f"  {label:<{width}}" + "".join(f" {cell:>11}" for cell in cells)
+        lines.append(line.rstrip())
+    return "\n".join([*lines, *ratio_lines(problem, metrics)])
+
+
+def cost_rows(problem: Problem, metrics: dict) -> list[tuple]:
+    """The cost, its parts, and the reward: label, optimum, ours, ratio."""
+    all_compared = not problem.waypoints or metrics["hit_rate"] == metrics["reference_hit_rate"] == 1
+    parts = {"cost_state": "  of it: state", "cost_control": "  of it: control", "cost_terminal": "  of it: terminal"}
+    optimum, ours = metrics["reference_cost_mean"], metrics["cost_mean"]
+    rows = [row(f"cost J (mean of {metrics['eval_starts']} starts)", optimum, ours, metrics.get("ratio_of_sums"))]
+    for part, label in parts.items():
+        optimum, ours = metrics[f"reference_{part}_mean"], metrics[f"{part}_mean"]
+        rows.append(row(label, optimum, ours, ours / optimum if all_compared and optimum else None))
+    optimum, ours = metrics["reference_episodic_return"], metrics["episodic_return"]
+    return [*rows, row("reward (bonus - J, mean)", optimum, ours, None)]
+
+
+def row(label: str, optimum: float, ours: float, ratio: float | None) -> tuple:
+    """A row's cells, to four digits."""
+    return label, f"{optimum:.4f}", f"{ours:.4f}", "-" if ratio is None else f"{ratio:.4f}"
+
+
+def hit_rows(problem: Problem, metrics: dict) -> list[tuple]:
+    """The shares of starts that hit their circles: label, optimum, ours, ratio."""
+    label = "starts that hit every circle" if problem.waypoints else "starts that hit the target circle"
+    rows = [(label, f"{metrics['reference_hit_rate']:.1%}", f"{metrics['hit_rate']:.1%}", "-")]
+    if problem.waypoints:
+        for k, phase in enumerate(problem.phases, start=1):
+            label = f"  circle {k}: {phase.target}, radius {phase.radius}"
+            rows.append((label, "", f"{metrics[f'hit_rate_phase_{k}']:.1%}", ""))
+    return rows
+
+
+def ratio_lines(problem: Problem, metrics: dict) -> list[str]:
+    """The lines below the table: the statistics of the cost ratio, or why there is none."""
+    if "ratio_of_sums" not in metrics:
+        reason = "no start hit every circle" if metrics["hit_rate"] == 0 else "where ours hit, the optimum does not"
+        return [f"  No cost ratio: {reason} (missing a circle is cheaper, not better)."]
+    over = "the starts that hit every circle" if problem.waypoints else f"all {metrics['eval_starts']} starts"
+    lines = [f"  Cost ratio ours / optimum over {over}:"]
+    lines.append(f"    mean {metrics['ratio_mean']:.4f}: the paper's statistic, a mean of ten starts, on average")
+    draws = {key: metrics.get(f"ten_start_ratio_mean_{key}") for key in ("p05", "p50", "p95")}
+    if None not in draws.values():  # fewer than ten starts, or an older eval.json
+        interval = f"{draws['p05']:.4f} to {draws['p95']:.4f} (5 % to 95 %), median {draws['p50']:.4f}"
+        lines.append(f"      {PAPER_DRAWS} draws of ten: {interval}")
+    if ends_at_origin(problem):
+        lines.append("      dominated by starts near the origin, where the optimal cost J* vanishes")
+    lines.append(f"    ratio of sums {metrics['ratio_of_sums']:.4f}")
+    statistics = ", ".join(f"{s} {metrics[f'ratio_{s}']:.4f}" for s in ("min", "median", "max", "p95"))
+    lines.append(f"    start by start: {statistics}")
+    if "loss_near_origin_mean" in metrics:
+        lines[-1] += f"; mean J - J* within {NEAR_ORIGIN} of the origin {metrics['loss_near_origin_mean']:.4f}"
+    return lines

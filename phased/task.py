@@ -1,0 +1,139 @@
+"""What is asked of a small problem's id, but for its optimum, which `baselines.py` solves: see `common.tasks.Task`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.errors import BadInput
+from phased.environment import fly
+from phased.metrics import comparable, flight_metrics, near_origin_metrics, ratio_metrics
+from phased.problem import Problem, starts
+from phased.table import table
+
+KEPT_STARTS = 100  # in a results folder
+
+
+@dataclass(frozen=True)
+class PhasedTask:
+    """A problem in `PROBLEMS`, measured over starts in its box."""
+
+    problem: Problem
+
+    @property
+    def env_id(self) -> str:
+        return self.problem.env_id
+
+    def optimum(self, eval_seed: int, n: int, **env_options) -> dict:
+        raise NotImplementedError  # baselines.py
+
+    # --- flying and measuring
+
+    def reset_options(self, eval_seed: int, n: int, **env_options) -> dict:
+        return {"x0": starts(eval_seed, n, self.problem.x0_max)}
+
+    def evaluate(self, policy, eval_seed: int, n: int, reference: dict | None = None, **env_options):
+        """As `Task.evaluate`. Raises ValueError if the reference belongs to other starts."""
+        problem, x0 = self.problem, starts(eval_seed, n, self.problem.x0_max)
+        flight = fly(self.env_id, policy, x0, **env_options)
+        if reference is None:
+            reference = self.optimum(eval_seed, n)
+        if not np.array_equal(reference["x"][:, 0], x0):
+            raise ValueError(f"reference does not belong to the {n} starts of eval_seed {eval_seed}")
+        compared = comparable(problem, flight["x"], reference["x"])
+        costs = flight["cost"][compared], reference["cost"][compared]
+        metrics = {"env_id": self.env_id, "eval_seed": eval_seed, "eval_starts": n}
+        metrics |= flight_metrics(flight, reference)
+        metrics |= ratio_metrics(*costs, eval_seed)
+        metrics |= near_origin_metrics(problem, x0[compared], *costs)
+        arrays = {"t": problem.dt * np.arange(problem.steps + 1)}
+        arrays |= {key: flight[key] for key in ("x", "u", "reward", "cost")}
+        arrays |= {f"{key}_reference": reference[key] for key in ("x", "u", "cost")}
+        return metrics, arrays
+
+    def reported_metrics(self, metrics: dict, timed_policy=None, **env_options) -> dict:
+        return {}
+
+    # --- the size of an evaluation, and what a run may not do
+
+    def default_flights(self, trains: bool, **env_options) -> int:
+        return 50 if trains else 1000
+
+    def interim_flights(self, n: int, **env_options) -> int:
+        return n
+
+    def remark_on_seed(self, eval_seed: int) -> str | None:
+        return f"--eval-seed {eval_seed} is the training's --seed: it may have flown these starts"
+
+    def refusal(self, trains: bool, **env_options) -> tuple[str, str] | None:
+        return None
+
+    # --- words and pictures
+
+    def table(self, metrics: dict) -> str:
+        return table(self.problem, metrics)
+
+    def seed_rows(self) -> dict[str, tuple[str, str]]:
+        return {
+            "ratio_of_sums": ("ratio of sums", ".4f"),
+            "ratio_mean": ("mean ratio", ".4f"),
+            "ratio_median": ("median ratio", ".4f"),
+            "ratio_p95": ("p95", ".4f"),
+            "loss_near_origin_mean": ("mean loss near the origin", ".4f"),
+            "hit_rate": ("starts that hit every circle", ".1%"),
+        }
+
+    def progress_keys(self, **env_options) -> list[str]:
+        return ["ratio_of_sums", "ratio_p95"]
+
+    def headline(self, metrics: dict) -> str:
+        """A figure's title: the problem and how close to the optimum the policy flies."""
+        if "ratio_of_sums" not in metrics:
+            return f"{self.env_id}: no cost ratio, {metrics['hit_rate']:.1%} of the starts hit every circle"
+        title = f"{self.env_id}: cost {metrics['ratio_of_sums']:.4f} x optimum"
+        if self.problem.waypoints:
+            return f"{title} over the starts that hit every circle ({metrics['hit_rate']:.1%})"
+        return f"{title} ({metrics['eval_starts']} starts)"
+
+    def figures(self, arrays: dict, metrics: dict, curves: list[dict]) -> dict:
+        from drawing.training import Miss, training_figure
+        from phased.figures import cost_error_figure, costs_figure, trajectories_figure
+
+        problem, title, figures = self.problem, self.headline(metrics), {}
+        if curves:
+            miss = Miss("eval/ratio_of_sums", "cost / optimum's, less 1, mean action", subtract=1.0)
+            figures["training.png"] = training_figure(curves, title, metrics["reference_episodic_return"], miss)
+        figures["trajectories.png"] = trajectories_figure(problem, arrays, title)
+        figures["costs.png"] = costs_figure(problem, arrays, title)
+        if not problem.waypoints:  # with them a missed circle would count as a gain
+            figures["cost_error.png"] = cost_error_figure(problem, arrays, title)
+        return figures
+
+    def animation(self, arrays: dict, metrics: dict):
+        from phased.animation import phase_plane_animation
+
+        return phase_plane_animation(self.problem, arrays, self.headline(metrics))
+
+    # --- files
+
+    def required_arrays(self, metrics: dict) -> set[str]:
+        return {"t", "x", "u", "reward", "cost", "x_reference", "u_reference", "cost_reference"}
+
+    def kept_arrays(self, arrays: dict) -> dict:
+        """Of the first `KEPT_STARTS`; all arrays but the times are by start."""
+        return {key: array if key == "t" else array[:KEPT_STARTS] for key, array in arrays.items()}
+
+    # --- commands
+
+    def speed_cases(self) -> list[tuple[str, dict, list | None]]:
+        return [("", {}, None)]
+
+    def add_arguments(self, parser) -> None:
+        raise NotImplementedError  # baselines.py
+
+    def baseline_command(self, args) -> tuple[dict, dict]:
+        raise NotImplementedError  # baselines.py
+
+    def fly_opponents(self, folder, **options) -> None:
+        raise BadInput(f"the env_id of {folder} is {self.env_id}; it must be a rocket's with cut-off")

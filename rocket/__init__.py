@@ -1,0 +1,1 @@
+"""The rockets: vehicle, physics, rewards, environment, optimum, guidance, metrics and pictures, a file each."""

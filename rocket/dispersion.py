@@ -1,0 +1,224 @@
+"""What differs from flight to flight: a draw is a vector of standard scores, in the order of `draw_names`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from common.errors import refuse_unless
+from rocket.vehicle import ROCKET, Rocket, engine_groups, engine_types
+
+
+@dataclass(frozen=True)
+class Dispersion:
+    """Standard deviations of a flight's differences from the table: relative ones, kg and m/s.
+
+    The studies named are quoted from memory and were not looked up again; "ours" is nobody else's number. A public
+    Monte-Carlo study of launch guidance has thrust 1 %, Isp 0.3 %, propellant and dry mass 0.5 %, density 5 %; one of
+    the Saturn V with 10 000 trials Isp 0.3 %, thrust 0.4 %.
+    """
+
+    burn_rate: float = 0.005  # thrust and flow together: between the studies' 0.4 % and 1 %
+    isp: float = 0.003  # thrust at a given flow: both studies'
+    propellant: float = 0.003  # load: ours, below the study's 0.5 %, for the burn rate moves the burn-out, too
+    dry_mass: float = 0.005  # the study's
+    payload: float = 20.0  # kg: ours, the study's 0.5 % of the paper's payload
+    drag: float = 0.14  # density times Cd: the study's 5 % of density and, ours, 13 % of Cd
+    wind: float = 20.0  # m/s at its altitude, east and north each: ours, the jet stream from day to day
+
+
+DISPERSION = Dispersion()
+OF_ENGINES = ("burn_rate", "isp", "propellant", "dry_mass")  # one score each for every type of engine
+OF_FLIGHT = ("payload", "drag", "wind_east", "wind_north")
+LARGEST_SCORE = 3.0  # drawn scores are clipped there
+LARGEST_CHANGE = 0.9  # part of its nominal value by which a drawn factor or payload may differ: nothing vanishes
+LARGEST_DISPERSION = 100.0
+
+
+class Vehicles(NamedTuple):
+    """N vehicles as they were drawn, arcs as in `Rocket.arcs` (A of them): what is constant between events."""
+
+    mass: np.ndarray  # (N,) kg at lift-off
+    dry_mass: np.ndarray  # (N,) kg, as `Rocket.dry_mass`
+    propellant: np.ndarray  # (N,) kg in the last stage
+    end: np.ndarray  # (A, N) s, the last infinite; the first ones are the ends of all burns but the last
+    thrust: np.ndarray  # (A, N) N
+    flow: np.ndarray  # (A, N) kg/s
+    dropped: np.ndarray  # (A, N) kg at the arc's end
+    burn_out: np.ndarray  # (N,) s: when the last stage has burnt what the nominal one burns, or runs dry
+    wind: np.ndarray  # (2, N) m/s, towards east and north where the profile is 1
+    drag: np.ndarray  # (N,) factor on the drag
+
+
+def draw_names(rocket: Rocket) -> tuple[str, ...]:
+    """What the k scores of a draw are of; types of engines are counted from 1."""
+    types = range(1, len(engine_types(rocket)) + 1)
+    return (*(f"{name}_{j}" for name in OF_ENGINES for j in types), *OF_FLIGHT)
+
+
+DRAW = draw_names(ROCKET)
+
+
+def draw_sigmas(rocket: Rocket) -> np.ndarray:
+    """(k,): the entry of `DISPERSION` for each score."""
+    table = {**vars(DISPERSION), "wind_east": DISPERSION.wind, "wind_north": DISPERSION.wind}
+    return np.array([table[name if name in table else name.rpartition("_")[0]] for name in draw_names(rocket)])
+
+
+def draw_bounds(rocket: Rocket, dispersion: float) -> np.ndarray:
+    """(k,): the largest score that is drawn: 3, less where a factor or the payload would change by more than 90 %."""
+    nominal = np.ones(len(draw_names(rocket)))
+    nominal[-4:] = rocket.payload, 1.0, np.inf, np.inf
+    sigmas = dispersion * draw_sigmas(rocket)
+    bounds = np.full(len(nominal), LARGEST_SCORE)
+    return np.minimum(bounds, np.divide(LARGEST_CHANGE * nominal, sigmas, out=bounds.copy(), where=sigmas > 0))
+
+
+def largest_draw(rocket: Rocket, dispersion: float) -> np.ndarray:
+    """(1, k): the draw of the vehicle that burns longest and is heaviest."""
+    types = len(engine_types(rocket))
+    signs = np.zeros(len(draw_names(rocket)))
+    signs[:types], signs[2 * types : 4 * types + 1] = -1.0, 1.0
+    return (signs * draw_bounds(rocket, dispersion))[None]
+
+
+class Factors(NamedTuple):
+    """What the draws make of the nominal values; the first four by type of engine, (types, N) each."""
+
+    burn_rate: np.ndarray
+    isp: np.ndarray
+    propellant: np.ndarray
+    dry_mass: np.ndarray
+    drag: np.ndarray  # (N,)
+    payload: np.ndarray  # (N,) kg, no factor
+    wind: np.ndarray  # (2, N) m/s towards east and north, no factor
+
+
+def draw_factors(rocket: Rocket, dispersion: float, draw: np.ndarray) -> Factors:
+    """The factors of scores (N, k). Raises BadInput for the first score that no vehicle can have."""
+    types = len(engine_types(rocket))
+    change = dispersion * draw_sigmas(rocket)[:, None] * draw.T
+    value = change + 1.0
+    value[-4] = change[-4] + rocket.payload
+    value[-2:] = change[-2:]
+    possible = value > 0
+    possible[-4] = value[-4] >= 0
+    possible[-2:] = True
+    if not possible.all():
+        k, n = np.argwhere(~possible)[0]
+        allowed = f"must be larger: with dispersion {dispersion} it makes of the nominal value {value[k, n]:.6g}"
+        refuse_unless(False, f"{draw_names(rocket)[k]} of draw {n}", draw[n, k], allowed)
+    of_engines = value[: 4 * types].reshape(4, types, -1)
+    return Factors(*of_engines, drag=value[-3], payload=value[-4], wind=value[-2:])
+
+
+def draw_vehicles(rocket: Rocket, dispersion: float, draw: np.ndarray) -> Vehicles:
+    """The vehicles of N draws (N, k): each value is the nominal one changed by dispersion times sigma times score.
+
+    Arcs are the burns, and a last one without thrust. What is loaded is burnt or dropped, also what an engine keeps
+    that uses a part of its propellant. Raises BadInput for a draw that no vehicle can have.
+    """
+    factors = draw_factors(rocket, dispersion, np.asarray(draw, dtype=np.float64))
+    type_of = {engine: j for j, engine in enumerate(engine_types(rocket))}
+    none = np.zeros_like(factors.payload)
+
+    def empty(parts):
+        return sum(n * (e.total_mass - e.propellant) * factors.dry_mass[type_of[e]] for n, e in parts)
+
+    def loaded(parts):
+        return sum(n * e.propellant * factors.propellant[type_of[e]] for n, e in parts)
+
+    def thrust(burn):
+        return sum(n * e.thrust * factors.burn_rate[type_of[e]] * factors.isp[type_of[e]] for n, e in burn.engines)
+
+    def flow(burn):
+        return sum(n * e.flow(rocket.table_isp) * factors.burn_rate[type_of[e]] for n, e in burn.engines)
+
+    end, burn_out, seconds_lit = burn_ends(rocket, factors.propellant / factors.burn_rate)
+    dropped = np.zeros_like(end)
+    for group, seconds in zip(engine_groups(rocket), seconds_lit):
+        if group.dropped_after < len(rocket.burns) - 1:
+            burnt = group.engine.flow(rocket.table_isp) * factors.burn_rate[group.type] * seconds
+            unburnt = np.maximum(group.engine.propellant * factors.propellant[group.type] - burnt, 0.0)
+            dropped[group.dropped_after] += empty([(group.number, group.engine)]) + group.number * unburnt
+
+    last = rocket.burns[-1].engines
+    aboard = [*(part for burn in rocket.burns for part in burn.dropped), *last]
+    return Vehicles(
+        mass=factors.payload + empty(aboard) + loaded(aboard),
+        dry_mass=factors.payload + empty(last),
+        propellant=none + loaded(last),
+        end=np.vstack([end, none + np.inf]),
+        thrust=np.array([*(thrust(burn) for burn in rocket.burns), none]),
+        flow=np.array([*(flow(burn) for burn in rocket.burns), none]),
+        dropped=np.vstack([dropped, none]),
+        burn_out=burn_out,
+        wind=factors.wind,
+        drag=factors.drag,
+    )
+
+
+def burn_ends(rocket: Rocket, lasting: np.ndarray):
+    """Ends of the burns (B, N) s, the last one's when it runs dry; `burn_out` (N,) s; seconds lit of the groups (G, N).
+
+    lasting (types, N): how long an engine's propellant lasts, as a part of the nominal time. A burn that drops burning
+    engines ends when the first of them has burnt as large a part of its propellant as nominally, any other at its
+    nominal time, and none goes on without an engine's propellant.
+    """
+    groups, last = engine_groups(rocket), len(rocket.burns) - 1
+    start = burn_out = np.zeros(lasting.shape[1])
+    seconds_lit = np.zeros((len(groups), lasting.shape[1]))
+    ends = []
+    for k, burn in enumerate(rocket.burns):
+        until_empty, until_due = seconds_left(groups, k, lasting, seconds_lit)
+        until_due = np.where(np.isfinite(until_due), until_due, burn.end - start)
+        burn_out = start + np.maximum(np.minimum(until_due, until_empty), 0.0)
+        end = start + np.maximum(until_empty, 0.0) if k == last else burn_out
+        for group, seconds in zip(groups, seconds_lit):
+            if k in group.burns:
+                seconds += end - start
+        ends.append(end)
+        start = end
+    return np.array(ends), burn_out, seconds_lit
+
+
+def seconds_left(groups, k: int, lasting: np.ndarray, seconds_lit: np.ndarray):
+    """From the beginning of burn k on: s until the first engine is empty, and until the first that leaves then is due.
+
+    (N,) each, infinite where there is none. An engine is due when it has burnt its nominal part of its propellant.
+    """
+    until_empty = until_due = np.full(lasting.shape[1], np.inf)
+    for group, seconds in zip(groups, seconds_lit):
+        if k not in group.burns or group.seconds_full == np.inf:
+            continue
+        until_empty = np.minimum(until_empty, group.seconds_full * lasting[group.type] - seconds)
+        if k == group.dropped_after:
+            until_due = np.minimum(until_due, group.seconds_lit * lasting[group.type] - seconds)
+    return until_empty, until_due
+
+
+def nominal_vehicles(rocket: Rocket, number: int) -> Vehicles:
+    """`number` vehicles just as the table has them; what a stage has not burnt (`table_isp`) stays on board."""
+    _, end, thrust, flow, dropped = np.array(rocket.arcs()).T
+    numbers = [rocket.x0[6], rocket.dry_mass, sum(n * engine.propellant for n, engine in rocket.burns[-1].engines)]
+    columns = [*numbers, np.append(end[:-1], np.inf), thrust, flow, dropped, rocket.burns[-1].end, np.zeros(2), 1.0]
+    return Vehicles(*(np.repeat(np.asarray(column)[..., None], number, axis=-1) for column in columns))
+
+
+def check_drawable(rocket: Rocket):
+    """BadInput where no flights can be drawn of a rocket: with all scores 0 it has to be the nominal one.
+
+    Drawn engines burn each from a tank of its own, and those that are dropped together burn together.
+    """
+    drawn = draw_vehicles(rocket, 1.0, np.zeros((1, len(draw_names(rocket)))))
+    last = len(rocket.burns) - 1
+    for k, (burn, dropped) in enumerate(zip(rocket.burns, rocket.jettison)):
+        ends, leaves = drawn.end[k, 0], drawn.dropped[k, 0]
+        same = np.isclose(burn.end, ends) or (k == last and (ends > burn.end or rocket.table_isp))
+        allowed = f"cannot be drawn: its engines, each from its own tank, burn until {ends:.6g} s"
+        refuse_unless(same, f"burns[{k}].end", burn.end, allowed)
+        same = np.isclose(dropped, leaves) or rocket.table_isp  # a drawn flight drops what has not burnt
+        allowed = f"cannot be drawn: with what has not burnt then it is {leaves:.6g} kg"
+        refuse_unless(same, f"what burns[{k}] drops", f"{dropped:.6g} kg", allowed)

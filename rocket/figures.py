@@ -1,0 +1,220 @@
+"""The rocket's figures: the ascent, its orbit, and where dispersed flights end."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle, Rectangle
+
+from drawing.style import BOUNDARY, OPTIMUM, POLICY, TARGET
+from rocket.metrics import BOX, altitude_km, element_misses, final_elements
+from rocket.missions import Mission
+from rocket.orbits import local_frame, orbit_vectors, target_axes, target_orbit
+from rocket.vehicle import Rocket
+
+DASHED = {"linewidth": 1.4, "linestyle": (0, (6, 5))}  # one line a panel: gaps that show the other line beneath
+OURS, BEST = {**POLICY, "linewidth": 2.2}, {**OPTIMUM, **DASHED}
+# velocities share a panel with positions: the same widths and dashes, paler
+VELOCITY = {**OURS, "color": "lightcoral"}, {**BEST, "color": "deepskyblue", "alpha": 0.6}
+FLIGHTS = {"": OURS, "_reference": BEST}  # by the suffix of their arrays
+
+
+def ascent_figure(mission: Mission, arrays: dict, title: str) -> Figure:
+    """The paper's six panels (mass, altitude, speed, components), the thrust direction below them, pitch and yaw."""
+    figure = Figure(figsize=(15, 13), layout="constrained")
+    rows = [["mass", "altitude", "speed"], ["x", "y", "z"], ["ux", "uy", "uz"]]
+    mosaic = [[name for name in row for _ in range(2)] for row in rows] + [["pitch"] * 3 + ["yaw"] * 3]
+    panels = figure.subplot_mosaic(mosaic, height_ratios=[3, 3, 1.3, 2])
+    velocity = [panels[axis].twinx() for axis in "xyz"]
+    for (side, style), pale in zip(FLIGHTS.items(), VELOCITY):
+        t, u, y = (arrays[f"{key}{side}"] for key in ("t", "u", "y"))
+        panels["mass"].plot(t, y[:, 6] / 1e3, **style)
+        panels["altitude"].plot(t, altitude_km(y, mission.rocket), **style)
+        panels["speed"].plot(t, np.linalg.norm(y[:, 3:6], axis=1) / 1e3, **style)
+        for k, axis in enumerate("xyz"):
+            panels[axis].plot(t, y[:, k] / 1e3, **style)
+            velocity[k].plot(t, y[:, 3 + k] / 1e3, **pale)
+            panels[f"u{axis}"].stairs(u[:, k], t, baseline=None, **{**style, "linewidth": style["linewidth"] / 1.5})
+        for name, angle in zip(("pitch", "yaw"), pitch_and_yaw(u, y, mission.rocket)):
+            panels[name].stairs(angle, t, baseline=None, **style)
+    label_ascent(panels, velocity, mission.rocket)
+    figure.suptitle(title)
+    lines = [(OURS, "policy"), (BEST, "optimum"), (VELOCITY[0], "velocity, policy")]
+    lines += [(VELOCITY[1], "velocity, optimum"), (BOUNDARY, "end of a phase")]
+    if mission.ceiling_km is not None:
+        panels["altitude"].axhline(mission.ceiling_km, **{**TARGET, "linestyle": "--"})
+        lines += [({**TARGET, "linestyle": "--"}, f"{mission.ceiling_km:.0f} km")]
+    handles = [Line2D([], [], **style, label=label) for style, label in lines]
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
+    return figure
+
+
+def label_ascent(panels: dict, velocity: list, rocket: Rocket):
+    """Axes' labels, the phases' ends, and what is dropped at each of them."""
+    labels = {"mass": "(a) mass (t)", "altitude": "(b) altitude (km)", "speed": "(c) inertial speed (km/s)"}
+    labels |= {axis: f"({letter}) position ${axis}$ (km)" for letter, axis in zip("def", "xyz")}
+    labels |= {f"u{axis}": f"thrust $u_{axis}$" for axis in "xyz"}
+    labels |= {"pitch": "pitch above the horizon (deg)", "yaw": "yaw from the target plane (deg)"}
+    for name, ax in panels.items():
+        ax.set(xlabel="time (s)", ylabel=labels[name], ylim=(-1.1, 1.1) if name[0] == "u" else None)
+        ax.grid(alpha=0.3)
+        for burn in rocket.burns[:-1]:
+            ax.axvline(burn.end, **BOUNDARY)
+    low, high = panels["yaw"].get_ylim()
+    panels["yaw"].set_ylim(min(low, -5), max(high, 5))  # a flight in the plane would show rounding errors only
+    for axis, ax in zip("xyz", velocity):
+        ax.set_ylabel(f"velocity $v_{axis}$ (km/s), pale", color="0.4")
+        ax.tick_params(axis="y", colors="0.4")
+    for k, (burn, dropped) in enumerate(zip(rocket.burns[:-1], rocket.jettison)):  # the last burn drops nothing
+        text, height = f" {burn.end:g} s: {dropped / 1e3:.2f} t dropped", 0.9 - 0.15 * (k % 5)  # of the axes
+        side = "left" if burn.end <= rocket.end_time / 2 else "right"  # towards the middle: inside the panel
+        where = {"transform": panels["mass"].get_xaxis_transform(), "horizontalalignment": side}
+        panels["mass"].text(burn.end, height, text if side == "left" else f"{text.strip()} ", fontsize=9, **where)
+
+
+def pitch_and_yaw(u: np.ndarray, y: np.ndarray, rocket: Rocket) -> tuple[np.ndarray, np.ndarray]:
+    """Pitch above the local horizon and yaw from the target plane, (K,) each in degrees, of u (K, 3) at y (K+1, 7).
+
+    Yaw is NaN within six degrees of the vertical: its direction there is noise.
+    """
+    up, along, cross = np.einsum("cdk,kd->ck", local_frame(y[: len(u)].T, target_axes(rocket)[2]), u)
+    yaw = np.where(np.hypot(along, cross) > 0.1, np.degrees(np.arctan2(cross, along)), np.nan)
+    return np.degrees(np.arcsin(np.clip(up, -1, 1))), yaw
+
+
+def target_points(rocket: Rocket) -> np.ndarray:
+    """Points (n, 3) in km, ECI, of the target orbit."""
+    return orbit_points(*target_orbit(rocket.target, rocket.mu), rocket)
+
+
+def reached_points(y: np.ndarray, rocket: Rocket) -> np.ndarray:
+    """Points (n, 3) in km, ECI, of the orbit that a flight y (K+1, 7) ended in."""
+    return orbit_points(*(np.array(vector) for vector in orbit_vectors(y[-1], rocket.mu)), rocket)
+
+
+def orbit_points(h: np.ndarray, e: np.ndarray, rocket: Rocket) -> np.ndarray:
+    """Points (n, 3) in km, ECI, of the orbit with this angular momentum and eccentricity vector, (3,) each.
+
+    r = p / (1 + e . d) in every direction d of its plane, p = |h|^2 / mu; NaN where a hyperbola has none.
+    """
+    normal = h / np.linalg.norm(h)
+    along = np.cross(normal, target_axes(rocket)[0])  # any direction of the plane will do to count from
+    ahead = along / np.linalg.norm(along)
+    angle = np.radians(np.linspace(-180, 180, 3601))[:, None]
+    directions = np.cos(angle) * np.cross(ahead, normal) + np.sin(angle) * ahead
+    slowness = 1 + directions @ e
+    r = (h @ h) / rocket.mu / 1e3 / np.where(slowness > 1e-3, slowness, np.nan)
+    return r[:, None] * directions
+
+
+def orbit_figure(mission: Mission, arrays: dict, title: str, highest_km: float) -> Figure:
+    """Ascent, target orbit and the orbit reached in the target's plane; the insertion enlarged; the ground track.
+
+    highest_km: the greatest altitude of both flights.
+    """
+    figure = Figure(figsize=(13, 11), layout="constrained")
+    panels = figure.subplot_mosaic([["plane", "insertion"], ["ground", "ground"]], height_ratios=[3, 2])
+    reached = reached_points(arrays["y"], mission.rocket)
+    lines = {
+        "target orbit": (target_points(mission.rocket), {**TARGET, "linewidth": 4.0, "alpha": 0.4}),
+        "policy": (arrays["y"][:, :3] / 1e3, OURS),
+        "orbit reached": (reached, {**OURS, "linewidth": 1.0, "linestyle": ":"}),
+        "optimum": (arrays["y_reference"][:, :3] / 1e3, BEST),
+    }
+    plot_target_plane(panels["plane"], panels["insertion"], lines, mission.rocket)
+    top = 1.15 * max(mission.ceiling_km or 0.0, highest_km)
+    panels["insertion"].set(ylim=(-0.03 * top, top))
+    plot_ground_track(panels["ground"], arrays, mission.rocket)
+    for ax in figure.axes:
+        ax.grid(alpha=0.3)
+    figure.suptitle(title)
+    figure.legend(*panels["plane"].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+    return figure
+
+
+def plot_target_plane(plane, insertion, lines: dict, rocket: Rocket):
+    """The target's plane, perigee to the right, to scale; and in it altitude over angle, from launch to insertion.
+
+    `lines`: label -> (points (n, 3) in km, ECI; style). The second panel cuts the first along the horizon.
+    """
+    axes, Re, ends = target_axes(rocket), rocket.Re / 1e3, []
+    launch = axes @ lines["policy"][0][0]
+    middle = np.degrees(np.arctan2(launch[1], launch[0])) + 90  # no ascent goes further round the Earth than half
+    for label, (r, style) in lines.items():
+        x, y, _ = axes @ r.T
+        angle, altitude = (np.degrees(np.arctan2(y, x)) - middle + 180) % 360 - 180, np.linalg.norm(r, axis=1) - Re
+        altitude[1:][np.abs(np.diff(angle)) > 180] = np.nan  # no line from one edge to the other
+        angle = angle + middle
+        plane.plot(x / 1e3, y / 1e3, label=label, **style)
+        insertion.plot(angle, altitude, **style)
+        if label in ("policy", "optimum"):
+            insertion.plot(angle[-1], altitude[-1], "o", color=style["color"], fillstyle="none")
+            ends += [angle[0], angle[-1]]
+    plane.add_patch(Circle((0, 0), Re / 1e3, color="0.85", zorder=0))
+    plane.text(0, 0, "Earth", ha="center", va="center")
+    a, b = rocket.a / 1e6, rocket.a / 1e6 * np.sqrt(1 - rocket.e**2)  # half axes
+    left, right = max(a * (1 + rocket.e), Re / 1e3), max(a * (1 - rocket.e), Re / 1e3)
+    margin, half = 0.06 * left, 1.1 * max(b, Re / 1e3)
+    plane.set(xlim=(-left - margin, right + margin), ylim=(-half, half), aspect="equal")
+    first = "the target's perigee" if rocket.e else f"{rocket.argp:g}° from the target's node"  # a circle's axes
+    plane.set(xlabel=f"towards {first} (1000 km)", ylabel="a right angle ahead of it (1000 km)")
+    plane.set_title("Plane of the target orbit")
+    insertion.set(xlabel=f"angle from {first} (deg)", ylabel="altitude (km)")
+    insertion.set(xlim=(min(ends) - 2, max(ends) + 8), title="Ascent and insertion (circles)")
+
+
+def plot_ground_track(ax, arrays: dict, rocket: Rocket):
+    """Longitude (the launch site's is 0) and geocentric latitude of both flights, over the turning Earth."""
+    along = np.radians(np.linspace(-90, 90, 361))[:, None]  # either side of the perigee
+    perigee, semi_latus, _ = target_axes(rocket)
+    circle = np.cos(along) * perigee + np.sin(along) * semi_latus
+    tracks = [(circle, 0.0, {**TARGET, "alpha": 0.4}, "target plane at launch")]
+    tracks += [(circle, arrays["t"][-1], {**TARGET, "alpha": 0.4, "linestyle": ":"}, "target plane at the end")]
+    tracks += [(arrays[f"y{side}"], arrays[f"t{side}"], style, "") for side, style in FLIGHTS.items()]
+    for r, t, style, label in tracks:
+        longitude = np.degrees(np.unwrap(np.arctan2(r[:, 1], r[:, 0])) - rocket.omega_e * t)
+        ax.plot(longitude, np.degrees(np.arctan2(r[:, 2], np.hypot(r[:, 0], r[:, 1]))), label=label or None, **style)
+    flown = np.concatenate([line.get_xydata() for line in ax.lines[2:]])
+    (west, south), (east, north) = flown.min(axis=0), flown.max(axis=0)
+    ax.set(xlim=(west - 2, east + 2), ylim=(south - 2, north + 2), title="Ground track")
+    ax.set(xlabel="longitude from the launch site (deg)", ylabel="geocentric latitude (deg)")
+    ax.legend(loc="lower left")
+
+
+# policies first; not green, which is the target's
+COLOURS = ("tab:red", "tab:orange", "tab:purple", "tab:cyan", "tab:brown", "tab:blue", "tab:pink", "tab:olive")
+COLOURS += ("tab:gray", "black", "gold", "navy")
+
+
+def dispersed_figure(rocket: Rocket, flights: dict[str, dict], title: str) -> Figure:
+    """Where dispersed flights end: perigee over its argument, inclination over the node, distribution of ||error||.
+
+    `flights`: label -> the `draw`, `final_y`, ... arrays of `evaluate_dispersed`, one colour each. Flights beyond
+    the axes, four boxes wide, are counted in the third panel alone. An angle that the target does not have is left out.
+    """
+    figure = Figure(figsize=(15, 5), layout="constrained")
+    *scatters, distribution = figure.subplots(1, 3)
+    for ax in figure.axes:
+        ax.set_prop_cycle(color=COLOURS)
+    labels = {"perigee_km": "perigee (km)", "i_deg": "inclination (deg)"}
+    labels |= {"raan_deg": "right ascension of the node (deg)", "argp_deg": "argument of perigee (deg)"}
+    for ax, (x, y) in zip(scatters, (("argp_deg", "perigee_km"), ("raan_deg", "i_deg"))):
+        for label, arrays in flights.items():
+            misses = element_misses(final_elements(arrays["final_y"], rocket), rocket)
+            across = misses.get(x, np.zeros(len(arrays["final_y"])))
+            ax.plot(across, misses[y], ".", markersize=3, alpha=0.5, label=label)
+        ax.add_patch(Rectangle((-BOX[x], -BOX[y]), 2 * BOX[x], 2 * BOX[y], fill=False, **TARGET))
+        ax.set(xlabel=f"{labels[x]} off the target", ylabel=f"{labels[y]} off the target")
+        ax.set(xlim=(-4 * BOX[x], 4 * BOX[x]), ylim=(-4 * BOX[y], 4 * BOX[y]))
+    for label, arrays in flights.items():
+        errors = np.sort(np.linalg.norm(arrays["final_error"], axis=1))
+        distribution.step(errors, np.arange(1, len(errors) + 1) / len(errors), where="post", label=label)
+    distribution.set(xlabel="$\\Vert$error$\\Vert$", ylabel="share of the flights at most that far off", xscale="log")
+    for ax in figure.axes:
+        ax.grid(alpha=0.3)
+    handles, names = distribution.get_legend_handles_labels()
+    handles.append(Line2D([], [], **TARGET))
+    figure.legend(handles, [*names, "a launcher's accuracy"], loc="outside lower center", ncols=min(len(handles), 5))
+    figure.suptitle(title)
+    return figure

@@ -1,0 +1,81 @@
+"""`python baselines.py rocket`, and of one rocket by its id: solve, print rows, checks and the open-loop opponent."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rocket.missions import ROCKETS
+from rocket.optimum import (
+    ASCENTS,
+    CUTOFF,
+    FIXED,
+    SEGMENTS,
+    STORED,
+    mission_case,
+    nine_pitch_angles,
+    optimise_ascent,
+    solve_ascent,
+)
+
+COLUMNS = ("final_mass_kg", "final_time_s", "error_norm", "replay_error_norm", "max_altitude_km", "solve_seconds")
+
+
+def report_all_rockets() -> tuple[dict, dict]:
+    """Solve `ASCENTS` and the other missions', print them and their checks; the numbers and arrays for the files."""
+    others = {key: mission_case(key, mission) for key, mission in ROCKETS.items() if key not in STORED}
+    numbers, flights, optima = solve_and_print(ASCENTS | others)
+    numbers["checks"] = optimum_checks(numbers, optima["free"])
+    for name, value in numbers["checks"].items():
+        print(f"{name:<32}{value:.7g}")
+    return numbers | open_loop_numbers(flights), solution_arrays(flights)
+
+
+def report_rocket(env_id: str) -> tuple[dict, dict]:
+    """Solve one mission and print it; the numbers and arrays for the files."""
+    numbers, flights, _ = solve_and_print({env_id: mission_case(env_id, ROCKETS[env_id])})
+    return numbers | open_loop_numbers(flights), solution_arrays(flights)
+
+
+def solve_and_print(cases: dict) -> tuple[dict, dict, dict]:
+    """Solve each case and print its row: its numbers, flight and collocation, by its key."""
+    print(f"{'':<16}" + "".join(f"{name:>19}" for name in COLUMNS) + "  status")
+    numbers, flights, optima = {}, {}, {}
+    for key, case in cases.items():
+        numbers[key], flights[key], optima[key] = solve_ascent(case)
+        cells = "".join(f"{numbers[key][name]:>19.10g}" for name in COLUMNS)
+        print(f"{key:<16}{cells}  {numbers[key]['status']}", flush=True)
+    return numbers, flights, optima
+
+
+def solution_arrays(flights: dict) -> dict:
+    """Times and directions of each flight, as --npz writes them."""
+    return {f"{key}_{name}": flight[name] for key, flight in flights.items() for name in ("t", "u")}
+
+
+def pontryagin_angle(optimum: dict):
+    """Angles (m,), degrees, between the thrust and the costate of the velocity, which the maximum principle wants 0."""
+    u, costate = optimum["u"], optimum["costate"]
+    return np.degrees(np.arctan2(np.linalg.norm(np.cross(u, costate), axis=1), (u * costate).sum(axis=1)))
+
+
+def optimum_checks(numbers: dict, optimum: dict) -> dict:
+    """Checks of `free`, by its collocation `optimum`: the maximum principle, the mass that drag costs, other meshes."""
+    mass, angle = numbers["free"]["final_mass_kg"], pontryagin_angle(optimum)
+    checks = {"costate_angle_deg_max": angle.max(), "costate_angle_deg_median": np.median(angle)}
+    checks["drag_free_mass_gain_kg"] = numbers["drag_free"]["final_mass_kg"] - mass
+    for segments in (SEGMENTS // 2, 2 * SEGMENTS):
+        checks[f"mass_change_kg_{segments}_segments"] = optimise_ascent(ASCENTS["free"], segments)["final_mass"] - mass
+    return {key: float(value) for key, value in checks.items()}
+
+
+def open_loop_numbers(flights: dict) -> dict:
+    """`nine_pitch_angles` of every mission whose optimum is among the flights, printed; its numbers by a name each."""
+    names, numbers = {CUTOFF: "nine_pitch_angles", FIXED: "nine_pitch_angles_fixed"}, {}
+    for env_id, mission in ROCKETS.items():
+        key, name = STORED.get(env_id, env_id), names.get(env_id, f"nine_pitch_angles_{env_id}")
+        flight = flights.get(env_id, flights.get(key))
+        if flight is not None:
+            opponent = nine_pitch_angles(env_id, flight, mission.rocket)
+            numbers[name] = {part: float(opponent[part]) for part in ("error_norm", "final_mass_kg", "final_time_s")}
+            print(f"{name:<40}" + "  ".join(f"{part} {value:.7g}" for part, value in numbers[name].items()))
+    return numbers
