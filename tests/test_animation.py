@@ -1,4 +1,4 @@
-"""animation.py and `render`: the GIF as Pillow reads it, frames of every environment, and what the drawings show."""
+"""Animations and `render`: the GIF as Pillow reads it, frames of every environment, and what the drawings show."""
 
 import json
 import shutil
@@ -6,17 +6,20 @@ import subprocess
 import sys
 from pathlib import Path
 
-import animation
 import gymnasium as gym
 import numpy as np
 import pytest
-from animation import Ascent, Flight, PhasePlane
 from gymnasium.error import ResetNeeded
 from gymnasium.wrappers import RecordVideo, RenderCollection
 from PIL import Image
 
 import envs
 import evaluate
+from common.evaluations import read_evaluation
+from drawing import animation
+from drawing.animation import Flight
+from phased.animation import PhasePlane
+from rocket.animation import AscentSheet
 
 ROOT = Path(__file__).parents[1]
 IDS = [*envs.PROBLEMS, *envs.ROCKETS]
@@ -113,13 +116,14 @@ def test_bad_folders_are_one_line_and_write_nothing(fault, tmp_path, monkeypatch
 
 
 def test_failing_write_leaves_the_old_gif(tmp_path, monkeypatch):
-    metrics, arrays = evaluate.read_evaluation(ROOT / "results" / "di")
+    metrics, arrays = read_evaluation(ROOT / "results" / "di")
     monkeypatch.setattr(animation, "FRAMES", 3)
-    (tmp_path / "animation.gif").write_bytes(b"old")
-    monkeypatch.setattr(animation.PhasePlane, "show", lambda *sides, ended: 1 / 0)
+    (tmp_path / "figures").mkdir()
+    (tmp_path / "figures" / "animation.gif").write_bytes(b"old")
+    monkeypatch.setattr(PhasePlane, "show", lambda *sides, ended: 1 / 0)
     with pytest.raises(ZeroDivisionError):
-        animation.write(tmp_path, arrays, metrics)
-    assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"old"]
+        evaluate.draw_animation(tmp_path, arrays, metrics)
+    assert [path.read_bytes() for path in (tmp_path / "figures").iterdir()] == [b"old"]
 
 
 # --- what the drawings show -------------------------------------------------------------------------------------------
@@ -145,7 +149,7 @@ def rocket_flight(result="rocket_cutoff", suffix=""):
 @pytest.mark.parametrize("time", [100.0, 400.0, 800.0, 924.0])
 def test_the_orbit_is_that_of_a_coast(time):
     """RK4 through half a revolution without thrust, air or ground stays on the ellipse that is drawn."""
-    sheet, mu = Ascent(envs.ROCKET), envs.ROCKET.mu
+    sheet, mu = AscentSheet(envs.ROCKET), envs.ROCKET.mu
     y = rocket_flight().until(time).y[-1]
 
     def fall(x, _):
@@ -164,7 +168,7 @@ def test_the_orbit_is_that_of_a_coast(time):
 
 
 def test_the_path_is_altitude_over_downrange():
-    flight, sheet = rocket_flight(), Ascent(envs.ROCKET)
+    flight, sheet = rocket_flight(), AscentSheet(envs.ROCKET)
     sheet.show([flight])
     x, altitude = sheet.paths[0].get_data()
     r = flight.y[:, :3]
@@ -189,7 +193,7 @@ def test_the_path_is_altitude_over_downrange():
     ],
 )
 def test_stagings_are_named_when_they_happen(time, ended, shown):
-    sheet = Ascent(envs.ROCKET)
+    sheet = AscentSheet(envs.ROCKET)
     flight = rocket_flight()
     sheet.show([flight.until(time)], ended=ended)
     named = [label.get_text().replace(" dropped", "") for label in sheet.labels if label.get_visible()]
@@ -200,7 +204,7 @@ def test_stagings_are_named_when_they_happen(time, ended, shown):
 
 def test_other_ends_are_named():
     crash = envs.fly_rocket("RocketAscent-v0", lambda obs, t: np.array([[-1.0, 0.0, 0.0]]), action_frame="local")
-    sheet = Ascent(envs.ROCKET)
+    sheet = AscentSheet(envs.ROCKET)
     for flight, name in (
         (Flight(crash["t"], crash["u"], crash["y"]), "crash"),
         (rocket_flight("rocket_fixed"), "burn"),
@@ -212,7 +216,7 @@ def test_other_ends_are_named():
 def test_circles_are_round_and_everything_is_in_view():
     flight = envs.fly("DoubleIntegrator-v0", lambda obs, t: np.full((1, 1), 4.0), np.array([[1.0, 1.0]]))
     sheet = PhasePlane(envs.DOUBLE_INTEGRATOR)
-    sheet.frame(Flight(0.1 * np.arange(51), flight["u"][0][:, None], flight["x"][0]))
+    sheet.frame(0.1 * np.arange(51), flight["u"][0][:, None], flight["x"][0])
     (left, bottom), (right, top) = sheet.plane.transData.transform([[-1, -1], [1, 1]])
     assert right - left == pytest.approx(top - bottom)
     assert sheet.plane.get_xlim()[1] > flight["x"][0, -1, 0] and sheet.plane.get_ylim()[1] > flight["x"][0, -1, 1]
@@ -341,10 +345,13 @@ import sys, gymnasium as gym, numpy as np, envs
 env = gym.make_vec("DoubleIntegrator-v0", num_envs=2, render_mode="rgb_array")
 env.reset(seed=0)
 env.step(np.zeros((2, 1)))
-heavy = {"matplotlib", "PIL", "animation", "figures"}
+heavy = {"matplotlib", "PIL", "drawing.animation", "drawing.style", "phased.animation"}
 print(sorted(heavy & sys.modules.keys()))
 env.render()
 print(sorted((heavy | {"matplotlib.pyplot", "torch", "casadi", "scipy"}) & sys.modules.keys()))
 """
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines() == ["[]", "['PIL', 'animation', 'figures', 'matplotlib']"]
+    assert done.stdout.splitlines() == [
+        "[]",
+        "['PIL', 'drawing.animation', 'drawing.style', 'matplotlib', 'phased.animation']",
+    ]

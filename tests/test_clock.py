@@ -6,18 +6,17 @@ import subprocess
 import sys
 
 import clock
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
 from robustness import TINY
 
-import envs
-
 
 @pytest.mark.parametrize("env_id", ["DoubleIntegratorWaypoints-v0", "VanDerPol-v0"])
 def test_the_hands_turn_with_the_episode(env_id):
     """Of the observations of an environment: after part s of the steps hand k has turned k s times."""
-    env = envs.gym.make(env_id)
+    env = gym.make(env_id)
     obs, ended = [env.reset(seed=1)[0]], False
     while not ended:
         next_obs, _, ended, *_ = env.step(np.zeros(1))

@@ -3,13 +3,16 @@
 import json
 import math
 
-import figures
+import gymnasium as gym
 import numpy as np
 import pytest
+from helpers import figure_of, table_of
 
 import envs
 import evaluate
 import runs
+from common.tasks import task_of
+from rocket.metrics import box_rate, dispersed_metrics, draws, evaluate_dispersed
 
 CUTOFF, LEO = "RocketAscentCutoff-v0", "TwoStageLEO-v0"
 FLIGHTS = 12
@@ -17,7 +20,7 @@ FLIGHTS = 12
 
 def optimum_replayed(env_id):
     """A policy: the optimum's directions, open loop, the last one held."""
-    u = evaluate.optimum(env_id, 0, 1)["u"]
+    u = task_of(env_id).optimum(0, 1)["u"]
     return lambda obs, t: np.repeat(u[None, min(t, len(u) - 1)], len(obs), axis=0)
 
 
@@ -76,8 +79,8 @@ def test_draws_are_the_seeds_and_nobody_elses(flown):
     expected = np.random.default_rng([7, 2]).standard_normal(arrays["draw"].shape).clip(-3, 3)
     np.testing.assert_array_equal(arrays["draw"], expected)
     rocket = envs.ROCKETS[env_id].rocket
-    np.testing.assert_array_equal(evaluate.draws(rocket, 1.0, 7, 5), expected[:5])
-    assert not np.isin(evaluate.draws(rocket, 1.0, 8, 5), expected[np.abs(expected) < 3]).any()
+    np.testing.assert_array_equal(draws(rocket, 1.0, 7, 5), expected[:5])
+    assert not np.isin(draws(rocket, 1.0, 8, 5), expected[np.abs(expected) < 3]).any()
     assert arrays["final_y"].shape == (FLIGHTS, 7) and arrays["final_t"].shape == (FLIGHTS,)
 
 
@@ -85,7 +88,7 @@ def test_one_flight_is_the_environments_own(flown):
     """Flight 3 alone, with its draw, ends where it ended in the batch, its true mass among the state."""
     metrics, arrays = flown
     env_id = metrics["env_id"]
-    env, policy, done, t = envs.gym.make(env_id, dispersion=1).unwrapped, optimum_replayed(env_id), False, 0
+    env, policy, done, t = gym.make(env_id, dispersion=1).unwrapped, optimum_replayed(env_id), False, 0
     obs, _ = env.reset(options={"draw": arrays["draw"][3]})
     while not done:
         obs, _, done, _, info = env.step(policy(obs[None], t)[0])
@@ -98,8 +101,8 @@ def test_one_flight_is_the_environments_own(flown):
 def test_batches_change_nothing(flown, monkeypatch):
     metrics, arrays = flown
     env_id = metrics["env_id"]
-    monkeypatch.setattr(evaluate, "AT_ONCE", 5)
-    again, ends = evaluate.evaluate_dispersed(env_id, optimum_replayed(env_id), 7, FLIGHTS, 1)
+    monkeypatch.setattr("rocket.metrics.AT_ONCE", 5)
+    again, ends = evaluate_dispersed(env_id, optimum_replayed(env_id), 7, FLIGHTS, 1)
     assert all(np.array_equal(ends[key], arrays[key]) for key in ends)
     assert all(metrics[key] == value for key, value in again.items())
 
@@ -117,7 +120,7 @@ def test_wilson_interval(inside, n):
     """(p + z^2 / 2n -+ z sqrt(p (1 - p) / n + z^2 / 4 n^2)) / (1 + z^2 / n), z = 1.959964."""
     z, p = 1.959963984540054, inside / n
     middle, half = p + z * z / (2 * n), z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
-    found = evaluate.box_rate(inside, n)
+    found = box_rate(inside, n)
     low, high = (middle - half) / (1 + z * z / n), (middle + half) / (1 + z * z / n)
     assert found["dispersed_box_low"] == pytest.approx(low, abs=1e-12)
     assert found["dispersed_box_high"] == pytest.approx(high, abs=1e-12)
@@ -130,7 +133,7 @@ def test_crashes_are_counted_and_leave_no_gap():
     assert metrics["dispersed_crashed"] == 10 and metrics["dispersed_box_rate"] == 0
     assert not any("perigee_error" in key and "dispersed" in key for key in metrics)
     assert all(math.isfinite(value) for value in metrics.values() if isinstance(value, float))
-    assert "10 crashed" in evaluate.table(metrics)
+    assert "10 crashed" in table_of(metrics)
 
 
 def test_only_closed_orbits_have_elements():
@@ -142,7 +145,7 @@ def test_only_closed_orbits_have_elements():
     flights |= {"i_deg": np.array([28.6, 28.4, 60.0, 5.0]), "error_norm": np.array([0.001, 0.002, 1.5, 1.0])}
     flights |= {"raan_deg": np.full(n, rocket.raan), "argp_deg": np.full(n, rocket.argp)}
     flights |= {"dry": np.array([0, 1, 0, 1], bool), "crashed": np.array([0, 0, 0, 1], bool)}
-    metrics = evaluate.dispersed_metrics(flights | {"final_mass_kg": np.array([7e3, 8e3, 9e3, 1e4])}, rocket)
+    metrics = dispersed_metrics(flights | {"final_mass_kg": np.array([7e3, 8e3, 9e3, 1e4])}, rocket)
     target = rocket.a / 1e3 * (1 - rocket.e) - rocket.Re / 1e3
     assert metrics["dispersed_perigee_error_mean_km"] == pytest.approx(185 - target)
     assert metrics["dispersed_perigee_error_std_km"] == pytest.approx(5.0)
@@ -154,13 +157,13 @@ def test_only_closed_orbits_have_elements():
 
 def test_table_and_figure(flown, tmp_path):
     metrics, arrays = flown
-    table = evaluate.table(metrics)
+    table = table_of(metrics)
     assert f"12 flights at dispersion 1: ||error|| median {metrics['dispersed_error_median']:.6f}" in table
-    figure = figures.draw_dispersed({"policy": arrays}, metrics)
+    figure = figure_of("dispersed.png", arrays, metrics)
     (points,) = [line for line in figure.axes[0].lines if len(line.get_xdata()) == FLIGHTS]
     mean = metrics["dispersed_perigee_error_mean_km"]
     assert np.mean(points.get_ydata()) == pytest.approx(mean, rel=1e-9, abs=1e-9)
-    names = {path.name for path in figures.draw(tmp_path, arrays, metrics)}
+    names = {path.name for path in evaluate.draw_figures(tmp_path, arrays, metrics, [])}
     assert names == {"trajectory.png", "orbit.png", "dispersed.png"}
 
 

@@ -4,18 +4,23 @@ import csv
 import errno
 import hashlib
 import json
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
 
-import animation
-import figures
 import numpy as np
 import pytest
+from helpers import figure_of, headline_of, table_of
 
+import baselines
 import envs
 import evaluate
+from common import files
+from common.curves import read_csv, read_curve, write_csv
+from common.files import write_json, write_npz
+from drawing import animation
+from drawing.training import median_curve
+from phased.metrics import cost_parts, hits_every_circle, near_origin_metrics, ratio_metrics
 
 ROOT = Path(__file__).parent.parent
 SINGLE, WAYPOINTS = "DoubleIntegrator-v0", "DoubleIntegratorWaypoints-v0"
@@ -63,7 +68,7 @@ def lets_go(policy, mask, t_end):
 def reference_flight(env_id, seed, n, misses=False):
     """A hand-made reference in the form of `baselines.reference`: a feedback that hits but in the flights `misses`."""
     policy = lets_go(feedback(env_id, 1e3, SOFT.get(env_id, 1.0)), misses, 90)
-    return envs.fly(env_id, policy, evaluate.starts(seed, n, envs.PROBLEMS[env_id].x0_max))
+    return envs.fly(env_id, policy, baselines.starts(seed, n, envs.PROBLEMS[env_id].x0_max))
 
 
 def make_run(folder, seed=1, env_id=SINGLE, level=0.0):
@@ -83,8 +88,8 @@ def make_run(folder, seed=1, env_id=SINGLE, level=0.0):
     reference = reference_flight(env_id, 3, 12)
     metrics, arrays = evaluate.evaluate(env_id, feedback(env_id, 1e3, effort=1.5), 3, 12, reference)
     digest = hashlib.sha256((folder / "agent.safetensors").read_bytes()).hexdigest()
-    evaluate.write_json(folder / "eval.json", {**metrics, "seed": seed, "checkpoint_sha256": digest})
-    evaluate.write_npz(folder / "eval.npz", arrays)
+    write_json(folder / "eval.json", {**metrics, "seed": seed, "checkpoint_sha256": digest})
+    write_npz(folder / "eval.npz", arrays)
     return folder
 
 
@@ -106,7 +111,7 @@ def command_line(monkeypatch, capsys, *words):
 
 
 def test_starts_are_those_of_the_interface():
-    assert np.array_equal(evaluate.starts(7, 5), np.random.default_rng(7).uniform(-1, 1, (5, 2)))
+    assert np.array_equal(baselines.starts(7, 5), np.random.default_rng(7).uniform(-1, 1, (5, 2)))
 
 
 @pytest.mark.parametrize("x0_max", [0.25, 3.0])
@@ -156,21 +161,21 @@ def test_metrics_of_a_single_phase_equal_plain_loops():
     }
     assert 0 < hits < n, "the case must tell hits from misses"
     assert {key: metrics[key] for key in expected} == pytest.approx(expected, rel=1e-12)
-    assert evaluate.cost_parts(SINGLE, arrays["x"], arrays["u"]) == pytest.approx(np.c_[state, control, terminal])
+    assert cost_parts(envs.PROBLEMS[SINGLE], arrays["x"], arrays["u"]) == pytest.approx(np.c_[state, control, terminal])
 
 
 @pytest.mark.parametrize("env_id", envs.PROBLEMS)
 def test_cost_parts_equal_the_environments(env_id):
-    flight = envs.fly(env_id, feedback(env_id, 5.0, effort=2.0), evaluate.starts(1, 6))
+    flight = envs.fly(env_id, feedback(env_id, 5.0, effort=2.0), baselines.starts(1, 6))
     parts = np.c_[flight["cost_state"], flight["cost_control"], flight["cost_terminal"]]
-    assert evaluate.cost_parts(env_id, flight["x"], flight["u"]) == pytest.approx(parts, rel=1e-12)
-    assert np.array_equal(evaluate.hits_every_circle(env_id, flight["x"]), flight["hit"].all(axis=1))
+    assert cost_parts(envs.PROBLEMS[env_id], flight["x"], flight["u"]) == pytest.approx(parts, rel=1e-12)
+    assert np.array_equal(hits_every_circle(envs.PROBLEMS[env_id], flight["x"]), flight["hit"].all(axis=1))
 
 
 def test_ten_start_statistic_is_the_papers():
     rng = np.random.default_rng(0)
     cost, optimum = rng.uniform(2, 3, (2, 40))
-    metrics = evaluate.ratio_metrics(cost, optimum, eval_seed=9)
+    metrics = ratio_metrics(cost, optimum, eval_seed=9)
     rng, means = np.random.default_rng([9, 1]), []
     for _ in range(100):
         drawn = rng.choice(40, 10, replace=False)
@@ -180,21 +185,21 @@ def test_ten_start_statistic_is_the_papers():
     assert metrics["ten_start_ratio_mean_p05"] == pytest.approx(means[4] + 0.95 * (means[5] - means[4]), rel=1e-12)
     assert metrics["ten_start_ratio_mean_p50"] == pytest.approx((means[49] + means[50]) / 2, rel=1e-12)
     assert metrics["ten_start_ratio_mean_p95"] == pytest.approx(means[94] + 0.05 * (means[95] - means[94]), rel=1e-12)
-    assert metrics == evaluate.ratio_metrics(cost, optimum, eval_seed=9)
-    assert metrics != evaluate.ratio_metrics(cost, optimum, eval_seed=10)
-    ten = evaluate.ratio_metrics(cost[:10], optimum[:10], eval_seed=9)
+    assert metrics == ratio_metrics(cost, optimum, eval_seed=9)
+    assert metrics != ratio_metrics(cost, optimum, eval_seed=10)
+    ten = ratio_metrics(cost[:10], optimum[:10], eval_seed=9)
     assert ten["ten_start_ratio_mean_p95"] == pytest.approx(ten["ratio_mean"])  # one way only to draw ten of ten
-    assert evaluate.ratio_metrics(cost[:9], optimum[:9], eval_seed=9).keys() == RATIOS
+    assert ratio_metrics(cost[:9], optimum[:9], eval_seed=9).keys() == RATIOS
 
 
 def test_loss_near_the_origin_by_hand():
     x0 = np.array([[0.0, 0.2], [0.12, -0.16], [0.15, 0.15], [-1.0, 0.0], [0.0, 0.0]])  # |x0| 0.2, 0.2, 0.21, 1, 0
     cost, optimum = np.array([0.5, 0.25, 9.0, 8.0, 0.0625]), np.array([0.25, 0.125, 1.0, 1.0, 0.0])
     expected = {"loss_near_origin_mean": (0.25 + 0.125 + 0.0625) / 3}
-    assert evaluate.near_origin_metrics(SINGLE, x0, cost, optimum) == pytest.approx(expected, rel=1e-14)
-    assert evaluate.near_origin_metrics("VanDerPol-v0", x0, cost, optimum) == pytest.approx(expected, rel=1e-14)
-    assert evaluate.near_origin_metrics(WAYPOINTS, x0, cost, optimum) == {}
-    assert evaluate.near_origin_metrics(SINGLE, x0[2:4], cost[2:4], optimum[2:4]) == {}
+    assert near_origin_metrics(envs.PROBLEMS[SINGLE], x0, cost, optimum) == pytest.approx(expected, rel=1e-14)
+    assert near_origin_metrics(envs.PROBLEMS["VanDerPol-v0"], x0, cost, optimum) == pytest.approx(expected, rel=1e-14)
+    assert near_origin_metrics(envs.PROBLEMS[WAYPOINTS], x0, cost, optimum) == {}
+    assert near_origin_metrics(envs.PROBLEMS[SINGLE], x0[2:4], cost[2:4], optimum[2:4]) == {}
 
 
 def test_no_loss_near_the_origin_where_the_target_is_elsewhere(new_problem):
@@ -204,7 +209,7 @@ def test_no_loss_near_the_origin_where_the_target_is_elsewhere(new_problem):
     reference = reference_flight(env_id, 5, 20)
     metrics, _ = evaluate.evaluate(env_id, feedback(env_id, 0.0, effort=60.0), 5, 20, reference)
     assert metrics.keys() & (RATIOS | NEAR) == RATIOS
-    assert "origin" not in evaluate.table(metrics)
+    assert "origin" not in table_of(metrics)
 
 
 def test_loss_near_the_origin_is_that_of_the_flights():
@@ -243,7 +248,7 @@ def test_waypoint_ratios_are_over_the_starts_that_hit_every_circle():
     assert metrics["hit_rate"] == metrics["hit_rate_phase_2"] == second / n
     assert metrics["hit_rate_phase_1"] == 1.0
     assert metrics["cost_mean"] == pytest.approx(sum(arrays["cost"]) / n, rel=1e-12)  # the means: all starts
-    lines = evaluate.table(metrics).splitlines()
+    lines = table_of(metrics).splitlines()
     assert lines[2].split()[-1] == f"{metrics['ratio_of_sums']:.4f}"
     assert [line.split()[-1] for line in lines[3:6]] == ["-"] * 3  # no ratio of parts of different starts
 
@@ -254,10 +259,10 @@ def test_waypoints_without_a_comparable_start_have_no_ratio(why):
     policy = lets_go(feedback(WAYPOINTS, 1e3), why == "none hits", 0)
     metrics, arrays = evaluate.evaluate(WAYPOINTS, policy, 2, 12, reference)
     assert metrics.keys() == COMMON | COSTS | HITS | {"hit_rate_phase_2"}
-    text = evaluate.table(metrics)
+    text = table_of(metrics)
     assert ("no start hit every circle" in text) == (why == "none hits")
     assert "No cost ratio" in text and "nan" not in text.lower()
-    assert "no cost ratio" in figures.headline(metrics)
+    assert "no cost ratio" in headline_of(metrics)
 
 
 @pytest.mark.parametrize("env_id", SOFT)
@@ -272,7 +277,7 @@ def test_keys_are_exactly_the_interfaces(env_id):
 @pytest.mark.parametrize("env_id", envs.PROBLEMS)
 def test_metrics_and_arrays_are_plain(env_id, tmp_path):
     """Of every problem: two flights that steer a little and not at all, wherever these lead."""
-    x0 = evaluate.starts(5, 20, envs.PROBLEMS[env_id].x0_max)
+    x0 = baselines.starts(5, 20, envs.PROBLEMS[env_id].x0_max)
     drift = envs.fly(env_id, lambda obs, t: np.zeros((len(obs), 1)), x0)
     metrics, arrays = evaluate.evaluate(env_id, lambda obs, t: -0.1 * obs[:, 1:2], 5, 20, drift)
     every_phase = {f"hit_rate_phase_{k}" for k in range(1, len(envs.PROBLEMS[env_id].phases) + 1)}
@@ -280,10 +285,10 @@ def test_metrics_and_arrays_are_plain(env_id, tmp_path):
     assert allowed <= metrics.keys() <= allowed | RATIOS | TEN_STARTS | NEAR
     assert {type(value) for value in metrics.values()} <= {str, int, float}
     assert all(np.isfinite(value) for value in metrics.values() if isinstance(value, float))
-    evaluate.write_json(tmp_path / "eval.json", metrics)
+    write_json(tmp_path / "eval.json", metrics)
     assert json.loads((tmp_path / "eval.json").read_text()) == metrics
     assert arrays.keys() == ARRAYS
-    evaluate.write_npz(tmp_path / "eval.npz", arrays)
+    write_npz(tmp_path / "eval.npz", arrays)
     with np.load(tmp_path / "eval.npz") as file:
         assert set(file.files) == ARRAYS
         assert all(np.array_equal(file[key], arrays[key]) for key in ARRAYS)
@@ -322,21 +327,10 @@ def test_missing_reference_is_solved_and_options_reach_the_environment(monkeypat
         seen.append(obs[0, 2])
         return np.zeros((len(obs), 1))
 
-    monkeypatch.setattr(evaluate.baselines, "reference", solve)
+    monkeypatch.setattr(baselines, "reference", solve)
     evaluate.evaluate(SINGLE, policy, 6, 10, observe_phase=False)
-    assert asked[0][0] == SINGLE and np.array_equal(asked[0][1], evaluate.starts(6, 10))
+    assert asked[0][0] == SINGLE and np.array_equal(asked[0][1], baselines.starts(6, 10))
     assert set(seen) == {0.0}
-
-
-@pytest.mark.parametrize("module", ["envs", "baselines", "opponents", "evaluate", "comparison", "figures", "animation"])
-def test_import_loads_nothing_heavy(module):
-    """A training and `--help` wait for none of these; a figure needs Matplotlib, but no window."""
-    heavy = {"torch", "casadi", "scipy", "matplotlib.pyplot"} | (
-        {"matplotlib"} if module not in ("figures", "animation") else set()
-    )
-    code = f"import {module}, sys; print(*{heavy} & sys.modules.keys())"
-    result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert result.stdout.strip() == ""
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -346,7 +340,7 @@ def test_import_loads_nothing_heavy(module):
 
 def test_table_shows_optimum_ours_and_ratio():
     metrics, _ = evaluate.evaluate(SINGLE, feedback(SINGLE, 20.0, 2.0), 5, 20, reference_flight(SINGLE, 5, 20))
-    lines = evaluate.table(metrics).splitlines()
+    lines = table_of(metrics).splitlines()
     assert lines[1].split() == ["optimum", "ours", "ratio"]
     for label, part in (("cost J (mean of 20 starts)", "cost"), ("of it: control", "cost_control")):
         (line,) = (line for line in lines if label in line)
@@ -368,29 +362,29 @@ def test_table_shows_optimum_ours_and_ratio():
 def test_table_of_an_older_evaluation_and_of_waypoints():
     metrics, _ = evaluate.evaluate(SINGLE, feedback(SINGLE, 20.0, 2.0), 5, 20, reference_flight(SINGLE, 5, 20))
     older = {key: value for key, value in metrics.items() if key not in NEAR | {"ten_start_ratio_mean_p05"}}
-    text = evaluate.table(older)
+    text = table_of(older)
     assert "draws of ten" not in text and "of the origin" not in text and f"mean {metrics['ratio_mean']:.4f}" in text
     metrics, _ = evaluate.evaluate(WAYPOINTS, feedback(WAYPOINTS, 1e3), 5, 20, reference_flight(WAYPOINTS, 5, 20))
-    text = evaluate.table(metrics)
+    text = table_of(metrics)
     assert "near the origin" not in text and "draws of ten" in text
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), np.float64("nan")])
 def test_json_refuses_what_is_not_finite_and_keeps_the_old_file(bad, tmp_path):
     path = tmp_path / "eval.json"
-    evaluate.write_json(path, {"seed": np.int64(1), "ratio_of_sums": np.float64(1.5)})
+    write_json(path, {"seed": np.int64(1), "ratio_of_sums": np.float64(1.5)})
     assert json.loads(path.read_text()) == {"seed": 1, "ratio_of_sums": 1.5}
     before = snapshot(tmp_path)
     with pytest.raises(ValueError, match="ratio_mean is"):
-        evaluate.write_json(path, {"seed": 2, "ratio_mean": bad})
+        write_json(path, {"seed": 2, "ratio_mean": bad})
     with pytest.raises(ValueError, match="laws is .*; eval.json holds finite"):
-        evaluate.write_json(path, {"seed": 2, "laws": {"replay": {"share": float(bad)}}})
+        write_json(path, {"seed": 2, "laws": {"replay": {"share": float(bad)}}})
     assert snapshot(tmp_path) == before
 
 
 def test_failing_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):
     path = tmp_path / "eval.npz"
-    evaluate.write_npz(path, {"x": np.arange(3)})
+    write_npz(path, {"x": np.arange(3)})
     before = snapshot(tmp_path)
 
     def break_off(file, **arrays):
@@ -399,10 +393,10 @@ def test_failing_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatc
 
     monkeypatch.setattr(np, "savez_compressed", break_off)
     with pytest.raises(OSError, match="no space left"):
-        evaluate.write_npz(path, {"x": np.arange(4)})
+        write_npz(path, {"x": np.arange(4)})
     assert snapshot(tmp_path) == before
     with pytest.raises(OSError):
-        evaluate.write_json(tmp_path / "no such folder" / "eval.json", {})
+        write_json(tmp_path / "no such folder" / "eval.json", {})
 
 
 def test_curve_of_a_resumed_run_keeps_the_last_value(tmp_path):
@@ -413,18 +407,18 @@ def test_curve_of_a_resumed_run_keeps_the_last_value(tmp_path):
             for step in steps:
                 writer.add_scalar("losses/policy_loss", step / 3 + shift, step)
             writer.add_scalar("eval/ratio_mean", 1.0 + shift, steps[-1])
-    curve = evaluate.read_curve(tmp_path)
+    curve = read_curve(tmp_path)
     steps, values = curve["losses/policy_loss"]
     assert steps.tolist() == [100, 200, 300, 400]
     assert values == pytest.approx([100 / 3, 200 / 3, 100.5, 400 / 3 + 0.5], rel=1e-6)
     path = tmp_path / "1.csv"
-    evaluate.write_csv(path, curve)
+    write_csv(path, curve)
     with open(path, newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["global_step"] for row in rows] == ["100", "200", "300", "400"]
     assert [row["eval/ratio_mean"] for row in rows] == ["", "", "1", "1.5"]
     assert path.read_text().startswith("global_step,")
-    again = evaluate.read_csv(path)
+    again = read_csv(path)
     assert again.keys() == curve.keys()
     for tag, (steps, values) in curve.items():
         assert np.array_equal(again[tag][0], steps)
@@ -432,7 +426,7 @@ def test_curve_of_a_resumed_run_keeps_the_last_value(tmp_path):
     for text in ("step,loss\n1,2\n", "global_step,loss\n1\n", ""):
         path.write_text(text)
         with pytest.raises(ValueError, match="not a training curve"):
-            evaluate.read_csv(path)
+            read_csv(path)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -443,7 +437,7 @@ def test_curve_of_a_resumed_run_keeps_the_last_value(tmp_path):
 def test_figures_show_policy_optimum_targets_and_bounds():
     reference = reference_flight(WAYPOINTS, 3, 12)
     metrics, arrays = evaluate.evaluate(WAYPOINTS, feedback(WAYPOINTS, 1e3, effort=2.0), 3, 12, reference)
-    figure = figures.draw_trajectories(arrays, metrics)
+    figure = figure_of("trajectories.png", arrays, metrics)
     plane, position, velocity, control = figure.axes
     assert [(patch.center, patch.radius) for patch in plane.patches] == [((0.0, 0.0), 0.02), ((0.5, 0.5), 0.02)]
     red = [line.get_ydata() for line in position.lines if line.get_color() == "tab:red"]
@@ -459,9 +453,9 @@ def test_cost_figure_shows_the_parts_and_marks_misses():
     policy = lets_go(feedback(WAYPOINTS, 1e3, effort=1.3), np.arange(12) == 2, 90)
     reference = reference_flight(WAYPOINTS, 3, 12)
     metrics, arrays = evaluate.evaluate(WAYPOINTS, policy, 3, 12, reference)
-    figure = figures.draw_costs(arrays, metrics)
+    figure = figure_of("costs.png", arrays, metrics)
     panels = {ax.get_ylabel(): ax for ax in figure.axes}
-    flown = envs.fly(WAYPOINTS, policy, evaluate.starts(3, 12))
+    flown = envs.fly(WAYPOINTS, policy, baselines.starts(3, 12))
     for name in ("state", "control", "terminal"):
         heights = [bar.get_height() for bar in panels[f"{name} cost"].patches]
         assert heights == pytest.approx([*flown[f"cost_{name}"][:10], *reference[f"cost_{name}"][:10]])
@@ -476,7 +470,7 @@ def test_cost_error_figure_shows_every_start(env_id, tmp_path):
     arrays["cost"][3] = arrays["cost_reference"][3] - 1e-3  # no loss: drawn as the smallest
     loss = [max(ours - best, 1e-6) for ours, best in zip(arrays["cost"], arrays["cost_reference"])]
     distance = [(x[0, 0] ** 2 + x[0, 1] ** 2) ** 0.5 for x in arrays["x"]]
-    figure = figures.draw_cost_error(arrays, metrics)
+    figure = figure_of("cost_error.png", arrays, metrics)
     box, over_distance, _ = figure.axes
     dots = box.collections[0]
     shown = sorted([*point, value] for point, value in zip(dots.get_offsets().tolist(), dots.get_array().tolist()))
@@ -490,13 +484,13 @@ def test_cost_error_figure_shows_every_start(env_id, tmp_path):
     assert over_distance.get_xscale() == over_distance.get_yscale() == "log"
     assert all(ax.get_xlabel() and ax.get_ylabel() for ax in (box, over_distance))
     arrays["cost"] = arrays["cost_reference"]  # the optimum itself can be drawn, too
-    assert tmp_path / "cost_error.png" in figures.draw(tmp_path, arrays, metrics)
+    assert tmp_path / "figures" / "cost_error.png" in evaluate.draw_figures(tmp_path, arrays, metrics, [])
 
 
 def test_median_curve_ends_with_the_shortest_seed():
     long = np.array([0, 10, 20, 30]), np.array([0.0, 1.0, 2.0, 3.0])
     short = np.array([5, 15, 25]), np.array([2.0, 4.0, 6.0])
-    grid, median = figures.median_curve([long, short])
+    grid, median = median_curve([long, short])
     assert grid.tolist() == [10, 20]
     assert median.tolist() == [(1 + 3) / 2, (2 + 5) / 2]
 
@@ -520,7 +514,7 @@ def test_publish_ships_the_first_seed_and_adds_the_second(tmp_path, monkeypatch,
     for name in ("agent.safetensors", "eval.json", "eval.npz"):
         assert files[Path(name)] == (first / name).read_bytes()
     assert files[Path("seeds/1.json")] == files[Path("eval.json")]
-    steps, returns = evaluate.read_csv(results / "seeds" / "1.csv")["charts/episodic_return"]
+    steps, returns = read_csv(results / "seeds" / "1.csv")["charts/episodic_return"]
     assert steps.tolist() == [4000 * update for update in range(1, 31)]
     assert returns == pytest.approx([14 - 30 * 0.8**update for update in range(1, 31)], rel=1e-6)
     for name, content in files.items():
@@ -569,7 +563,7 @@ def test_seeds_alone_say_of_which_problem_a_folder_is(tmp_path):
 def test_a_curve_that_is_none_is_named(tmp_path, text):
     (tmp_path / "1.csv").write_text(text)
     with pytest.raises(ValueError, match="1.csv is not a training curve"):
-        evaluate.read_csv(tmp_path / "1.csv")
+        read_csv(tmp_path / "1.csv")
 
 
 def test_shipping_another_seed_replaces_all_or_nothing(tmp_path, monkeypatch, capsys):
@@ -594,7 +588,7 @@ def test_shipping_another_seed_replaces_all_or_nothing(tmp_path, monkeypatch, ca
         monkeypatch.setattr(evaluate, function, draw(name))
     (results / "opponents.json").write_text("of seed 1")
     with monkeypatch.context() as patch:
-        write = evaluate.write_bytes
+        write = files.write_bytes
         patch.setattr(
             evaluate, "write_bytes", lambda path, data: (full_disk if results in path.parents else write)(path, data)
         )
@@ -613,7 +607,7 @@ def test_a_seed_is_listed_once_the_rest_is_there(tmp_path, monkeypatch, capsys):
     run, results, written = make_run(tmp_path / "run", seed=1), tmp_path / "results", []
     for name in ("redraw", "animate"):
         monkeypatch.setattr(evaluate, name, lambda folder: [])
-    write = evaluate.write_bytes
+    write = files.write_bytes
     monkeypatch.setattr(evaluate, "write_bytes", lambda path, data: [written.append(Path(path)), write(path, data)])
     command_line(monkeypatch, capsys, "publish", run, results)
     assert written[-1] == results / "seeds" / "1.json"
@@ -714,8 +708,8 @@ def test_training_figure_of_a_small_problem_shows_what_the_mean_action_loses():
         }
         for factor in (1, 2, 4)
     ]
-    metrics, _ = evaluate.evaluate(SINGLE, feedback(SINGLE, 1e3), 0, 5)
-    figure = figures.draw_training(curves, metrics)
+    metrics, arrays = evaluate.evaluate(SINGLE, feedback(SINGLE, 1e3), 0, 5)
+    figure = figure_of("training.png", arrays, metrics, curves)
     returns, *_, loss = figure.axes
     assert len(figure.axes) == 4 and loss.get_yscale() == "log" and "less 1" in loss.get_ylabel()
     drawn = [line.get_ydata() for line in loss.lines]

@@ -1,4 +1,4 @@
-"""Dispersed flights compared with their mean, step by step: what `learn_buffers` learns and the policy sees of it."""
+"""Dispersed flights compared with their mean, step by step: what `update_running_statistics` learns and is seen."""
 
 import gymnasium as gym
 import numpy as np
@@ -53,7 +53,7 @@ def test_the_mean_is_of_the_flights_that_live(flights):
     agent, args = make_agent()
     rocket = ROCKETS[CUTOFF].rocket
     assert agent.mean_flight.shape == (482, 7) and not agent.mean_flight.any()
-    script.learn_buffers(agent, agent, args, flights)
+    script.update_running_statistics(agent, agent, args, flights)
     expected = np.zeros((482, 7))
     for t in range(60):
         living = [k for k in range(8) if flights.alive[t, k]]
@@ -64,9 +64,9 @@ def test_the_mean_is_of_the_flights_that_live(flights):
     np.testing.assert_allclose(agent.mean_flight.numpy(), expected, **near)
     higher = script.Batch(**{**vars(flights), "obs": flights.obs * torch.tensor([1.001] * 3 + [1.0] * 6)})
     one = script.Batch(**{**vars(higher), "alive": flights.alive * (torch.arange(8) == 0)})
-    script.learn_buffers(agent, agent, args, one)
+    script.update_running_statistics(agent, agent, args, one)
     np.testing.assert_allclose(agent.mean_flight.numpy(), expected, **near)  # one of eight says little
-    script.learn_buffers(agent, agent, args, higher)
+    script.update_running_statistics(agent, agent, args, higher)
     raised = [
         np.mean([compared(flights.obs[5, k].numpy() * ([1.001] * 3 + [1] * 6), rocket) for k in range(8)], axis=0)
     ]
@@ -76,7 +76,7 @@ def test_the_mean_is_of_the_flights_that_live(flights):
 def test_without_dispersion_nothing_is_learnt(flights):
     agent, args = make_agent(0.0)
     before = {name: tensor.clone() for name, tensor in agent.state_dict().items()}
-    script.learn_buffers(agent, agent, args, flights)
+    script.update_running_statistics(agent, agent, args, flights)
     for name, tensor in agent.state_dict().items():
         assert torch.equal(tensor, before[name]), name
 
@@ -86,7 +86,7 @@ def test_what_is_seen_of_a_flight_beside_the_mean(flights):
     agent, args = make_agent()
     rocket, t = ROCKETS[CUTOFF].rocket, 30
     assert not script.features(agent, flights.obs)[..., -7:].any()
-    script.learn_buffers(agent, agent, args, flights)
+    script.update_running_statistics(agent, agent, args, flights)
     seen = script.features(agent, flights.obs)
     assert seen.shape == (60, 8, 36)
     mean = np.mean([compared(flights.obs[t, k].numpy(), rocket) for k in range(3)], axis=0)
@@ -124,13 +124,13 @@ def test_what_comes_into_sight_changes_nothing_at_first(flights):
     agent, args = make_agent()
     obs, memory = flights.obs.transpose(0, 1), agent.new_memory(8, 0.0)
     before = agent.encode(obs, memory)
-    script.learn_buffers(agent, agent, args, flights)
+    script.update_running_statistics(agent, agent, args, flights)
     torch.testing.assert_close(agent.encode(obs, memory), before, rtol=0, atol=0)
     assert script.features(agent, flights.obs)[..., -7:].any()
     with torch.no_grad():
         agent.encoder[0].weight[:, -7:] = 0.5
     assert (agent.encode(obs, memory) != before).any()
-    script.learn_buffers(agent, agent, args, flights)
+    script.update_running_statistics(agent, agent, args, flights)
     assert (agent.encoder[0].weight[:, -7:] == 0.5).all()
 
 
@@ -141,7 +141,7 @@ def test_it_changes_nothing_at_first_in_what_evaluation_flies(flights):
     obs, memory = flights.obs.transpose(0, 1), agent.new_memory(8, 0.0)
     before = average.module.encode(obs, memory)
     average.update_parameters(agent)
-    script.learn_buffers(agent, average.module, args, flights)
+    script.update_running_statistics(agent, average.module, args, flights)
     average.update_parameters(agent)
     assert script.features(average.module, flights.obs)[..., -7:].any()
     torch.testing.assert_close(average.module.encode(obs, memory), before, rtol=0, atol=1e-12)
@@ -157,7 +157,7 @@ def test_the_oracles_draw_changes_nothing_at_first(flights):
     encode = lambda batch: agent.encode(batch.obs.transpose(0, 1), agent.new_memory(8, 0.0))  # noqa: E731
     before = encode(zero)
     assert (encode(seen) != before).any()
-    script.learn_buffers(agent, agent, args, seen)
+    script.update_running_statistics(agent, agent, args, seen)
     torch.testing.assert_close(encode(seen), before, rtol=0, atol=0)
 
 
@@ -166,6 +166,6 @@ def test_a_nominal_training_leaves_the_draw_without_weight(flights):
     args = script.Args(**SMALL, env_id=CUTOFF, observe_draw=True)
     agent = script.Agent(args, gym.make_vec(CUTOFF, num_envs=1, observe_draw=True)).double()
     seen = script.Batch(**{**vars(flights), "obs": torch.cat([flights.obs, torch.zeros(60, 8, 16)], dim=-1)})
-    script.learn_buffers(agent, agent, args, seen)
+    script.update_running_statistics(agent, agent, args, seen)
     assert not agent.encoder[0].weight[:, -23:].any() and agent.encoder[0].weight[:, -24].any()
     assert not agent.mean_flight.any()

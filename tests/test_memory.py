@@ -9,6 +9,7 @@ from pathlib import Path
 from unittest import mock
 
 import attention
+import gymnasium as gym
 import memory
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ import baselines
 import envs
 import evaluate
 import ppo_gtrxl_di as script
+from phased.metrics import ratio_metrics
 
 ROOT = Path(__file__).parent.parent
 torch.set_num_threads(1)
@@ -31,7 +33,7 @@ def test_weights_are_the_networks(L):
     """Put to work on the values, they give what the attention itself gives; before the start stands the memory."""
     args = script.Args(embed_dim=8, num_heads=2, mlp_dim=8, hidden_dim=8, num_blocks=2, memory_length=L)
     torch.manual_seed(1)
-    agent = script.Agent(args, evaluate.envs.gym.make_vec(args.env_id, num_envs=1)).double()
+    agent = script.Agent(args, gym.make_vec(args.env_id, num_envs=1)).double()
     for block in agent.blocks:
         block.attention.R.normal_()
     obs = np.random.default_rng(0).uniform(-3, 3, (23, 3))
@@ -58,7 +60,7 @@ def test_gates_are_the_networks():
     """A gate that is forced open or shut is found as such; an untrained one is near sigmoid(2)."""
     args = script.Args(embed_dim=8, num_heads=2, mlp_dim=8, hidden_dim=8, num_blocks=2, memory_length=5)
     torch.manual_seed(1)
-    agent = script.Agent(args, evaluate.envs.gym.make_vec(args.env_id, num_envs=1)).double()
+    agent = script.Agent(args, gym.make_vec(args.env_id, num_envs=1)).double()
     obs = np.random.default_rng(0).uniform(-3, 3, (23, 3))
     start = attention.gates(agent, obs)[..., 0]
     assert start.shape == (2, 2) and np.abs(start - attention.UNTRAINED).max() < 0.1
@@ -89,7 +91,7 @@ def test_the_flight_begins_with_the_evaluations_first_start(new_problem):
     env_id = new_problem(dataclasses.replace(envs.DOUBLE_INTEGRATOR, env_id="WideBox-v0", x0_max=2.5))
     args, resting = script.Args(env_id=env_id), mock.Mock()
     resting.make_policy.return_value = lambda obs, t: np.zeros((1, 1))
-    obs, t = attention.observations(resting, args, {}, eval_seed=3)
+    obs, t, _ = attention.observations(resting, args, {}, eval_seed=3)
     _, flight = evaluate.evaluate(env_id, lambda obs, t: np.zeros((len(obs), 1)), 3, 10)
     np.testing.assert_allclose(obs[:, :2], flight["x"][0, :-1])
     assert len(t) == len(obs) == 50 and np.abs(obs[0, :2]).max() < 2.5
@@ -183,7 +185,7 @@ def test_another_law_has_the_lower_p95():
     found = []
     for gain in (K[0][0], 1.5):
         blind = lambda obs, t, gain=gain: law(obs, t) if t else -gain * obs[:, :1]  # noqa: E731
-        found.append(evaluate.ratio_metrics(envs.fly(problem.env_id, blind, x0)["cost"], best["cost"], 0))
+        found.append(ratio_metrics(envs.fly(problem.env_id, blind, x0)["cost"], best["cost"], 0))
     equivalent, weaker = found
     assert memory.velocity_from_the_second_step() == {"ratio_of_sums": pytest.approx(equivalent["ratio_of_sums"])}
     assert weaker["ratio_of_sums"] > equivalent["ratio_of_sums"] + 0.003

@@ -4,26 +4,29 @@ import json
 import shutil
 from pathlib import Path
 
-import comparison
+import gymnasium as gym
 import numpy as np
-import opponents
 import pytest
-from rocket_baselines import NoOptimum, rocket_reference
 from rocket_oracle import CUTOFF, LEO, PAPER
 
 import envs
 import evaluate
+from common.errors import NoOptimum
 from envs import ROCKET, ROCKETS
+from rocket import comparison, guidance
+from rocket.dispersion import DRAW
+from rocket.metrics import dispersed_metrics, draws, evaluate_dispersed, fly_dispersed
+from rocket.optimum import rocket_reference
 
 ROOT = Path(__file__).parents[1]
 SHIPPED = ROOT / "results" / "rocket_cutoff"
-SCORES = len(envs.DRAW)
+SCORES = len(DRAW)
 HIT = 0.015  # the success of the compared flights: of three that are replayed one is none
 
 
 def ends(law, z, env_id=CUTOFF):
     """The ends of flights with the draws z (m, k) at dispersion 1."""
-    return evaluate.fly_dispersed(env_id, law, np.asarray(z), 1.0)
+    return fly_dispersed(env_id, law, np.asarray(z), 1.0)
 
 
 # --- open loop and LQR ------------------------------------------------------------------------------------------------
@@ -32,7 +35,7 @@ def ends(law, z, env_id=CUTOFF):
 @pytest.mark.parametrize("env_id", [CUTOFF, LEO])
 def test_without_a_difference_every_law_of_the_optimum_reaches_the_target(env_id):
     z = np.zeros((1, len(envs.draw_names(ROCKETS[env_id].rocket))))
-    for law in (opponents.replay(env_id), opponents.tvlqr(env_id), opponents.tvlqr(env_id, by_energy=True)):
+    for law in (guidance.open_loop(env_id), guidance.tvlqr(env_id), guidance.tvlqr(env_id, by_energy=True)):
         assert ends(law, z, env_id)["error_norm"][0] < 2e-4
 
 
@@ -40,8 +43,8 @@ def test_without_a_difference_every_law_of_the_optimum_reaches_the_target(env_id
 def linear():
     """The optimum, its steering axes, A (K, 6, 6) and B (K, 6, 2)."""
     flight = rocket_reference(CUTOFF)
-    axes = opponents.normal_axes(flight["u"])
-    return flight, axes, *opponents.linearise_flight(ROCKETS[CUTOFF], flight, axes)
+    axes = guidance.normal_axes(flight["u"])
+    return flight, axes, *guidance.linearise_flight(ROCKETS[CUTOFF], flight, axes)
 
 
 @pytest.mark.parametrize("k", [3, 37, 75, 130, 300, 461])  # 37 to 130: steps with a staging; 462 is the last
@@ -67,15 +70,15 @@ def test_linearised_steps_are_scipys(linear, k):
 def test_gains_are_the_least_squares_of_the_last_steps(linear):
     """From step K - 12 on: the angles that minimise |C x_K|^2 + R dt |angles|^2, all at once, without a recursion."""
     flight, _, A, B = linear
-    gains, _ = opponents.lqr_gains(ROCKETS[CUTOFF], flight)
+    gains, _ = guidance.lqr_gains(ROCKETS[CUTOFF], flight)
     K, first, dt = len(A), len(A) - 12, np.diff(flight["t"])
     rate = (flight["y"][-1] - flight["y"][-2])[:6] / dt[-1]
-    C = opponents.cutoff_jacobian(ROCKET, flight["y"][-1], rate)
+    C = guidance.cutoff_jacobian(ROCKET, flight["y"][-1], rate)
     ahead, columns = np.eye(6), []
     for k in reversed(range(first, K)):
         columns.insert(0, C @ ahead @ B[k])
         ahead = ahead @ A[k]
-    weights = np.sqrt(opponents.STEERING_WEIGHT * np.repeat(dt[first:], 2))
+    weights = np.sqrt(guidance.STEERING_WEIGHT * np.repeat(dt[first:], 2))
     system = np.vstack([np.hstack(columns), np.diag(weights)])
     best = np.linalg.lstsq(system, np.vstack([-C @ ahead, np.zeros((24, 6))]), rcond=1e-15)[0][:2]
     np.testing.assert_allclose(-gains[first], best, rtol=1e-5, atol=1e-7 * np.abs(best).max())
@@ -85,7 +88,7 @@ def test_what_is_along_the_trajectory_costs_nothing():
     """And what keeps the energy costs its terminal error."""
     y = rocket_reference(CUTOFF)["y"][-1]
     rate = np.append(y[3:6], -ROCKET.mu * y[:3] / np.linalg.norm(y[:3]) ** 3 + 14.0 * y[3:6] / np.linalg.norm(y[3:6]))
-    C = opponents.cutoff_jacobian(ROCKET, y, rate)
+    C = guidance.cutoff_jacobian(ROCKET, y, rate)
     beside = np.append([30.0, -20.0, 10.0], [0.02, 0.01, -0.03])
     assert np.linalg.norm(C @ rate) < 1e-9 < 1e-6 < np.linalg.norm(C @ beside)
     moved = y[:6] + beside
@@ -99,8 +102,8 @@ def test_what_is_along_the_trajectory_costs_nothing():
 
 def test_feedback_is_worth_something():
     """On the same eight draws the LQR ends closer than the replay; by energy the worst flight closer still."""
-    z = evaluate.draws(ROCKET, 1.0, 5, 8)
-    laws = opponents.replay(CUTOFF), opponents.tvlqr(CUTOFF), opponents.tvlqr(CUTOFF, by_energy=True)
+    z = draws(ROCKET, 1.0, 5, 8)
+    laws = guidance.open_loop(CUTOFF), guidance.tvlqr(CUTOFF), guidance.tvlqr(CUTOFF, by_energy=True)
     open_loop, by_time, by_energy = (ends(law, z)["error_norm"] for law in laws)
     assert (by_time < open_loop / 2).all() and by_time.max() < 2e-3
     assert by_energy.max() < 5e-4 and by_energy.max() < by_time.max()
@@ -111,7 +114,7 @@ def test_by_energy_a_late_flight_is_no_other_flight():
     flight = rocket_reference(CUTOFF)
     places = np.array([150, 300, 450])
     obs = np.column_stack([flight["y"][places], np.zeros(3), np.ones(3)])
-    by_time, by_energy = (opponents.tvlqr(CUTOFF, by_energy=choice)(obs, 140) for choice in (False, True))
+    by_time, by_energy = (guidance.tvlqr(CUTOFF, by_energy=choice)(obs, 140) for choice in (False, True))
     np.testing.assert_allclose(by_energy, flight["u"][places], atol=1e-9)
     assert (np.linalg.norm(by_time - flight["u"][places], axis=1) > 0.01).all()
 
@@ -120,7 +123,7 @@ def test_by_energy_a_late_flight_is_no_other_flight():
 @pytest.mark.parametrize("by_energy", [False, True])
 def test_a_late_flight_is_steered_as_gently_as_the_one_before(env_id, by_energy):
     """The optimum's last step is a fraction of the others, and the angle that mends an error within it is large."""
-    flight, law = rocket_reference(env_id), opponents.tvlqr(env_id, by_energy)
+    flight, law = rocket_reference(env_id), guidance.tvlqr(env_id, by_energy)
     last, beside = len(flight["u"]), np.repeat([10.0, 0.05], 3)  # m and m/s
 
     def turn(place, t):
@@ -136,15 +139,15 @@ def test_a_late_flight_is_steered_as_gently_as_the_one_before(env_id, by_energy)
 def test_plans_have_directions_until_the_last_vehicle_burns_out(env_id):
     """The 1705 draws of eval seed 0: some burn longer than the nominal vehicle may."""
     rocket = ROCKETS[env_id].rocket
-    burn_out = envs.draw_vehicles(rocket, 1.0, evaluate.draws(rocket, 1.0, 0, 1705)).burn_out.max()
-    assert rocket.end_time < burn_out < opponents.middles(rocket)[-1]
+    burn_out = envs.draw_vehicles(rocket, 1.0, draws(rocket, 1.0, 0, 1705)).burn_out.max()
+    assert rocket.end_time < burn_out < guidance.middles(rocket)[-1]
 
 
 # --- what solves ------------------------------------------------------------------------------------------------------
 
 
 def test_replanning_the_nominal_flight_loses_nothing():
-    law = opponents.Replan(CUTOFF)
+    law = guidance.Replanning(CUTOFF)
     flown = ends(law, np.zeros((1, SCORES)))
     assert len(law.seconds) >= 30 and law.failed == 0
     assert flown["error_norm"][0] < 2e-5
@@ -154,21 +157,21 @@ def test_replanning_the_nominal_flight_loses_nothing():
 
 def test_replanning_meets_what_the_replay_misses(monkeypatch):
     """A flight with less thrust and more drag; the plans are for the vehicle that the law believes in."""
-    monkeypatch.setattr(opponents, "REPLAN_EVERY", 100.0)
+    monkeypatch.setattr(guidance, "REPLAN_EVERY", 100.0)
     z = np.zeros((1, SCORES))
     z[0, [2, 5, SCORES - 3]] = -2.0, -2.0, 2.0
-    seen, solve = [], opponents.optimise_rest
+    seen, solve = [], guidance.optimise_remaining
 
     def spy(rocket, rest, guess, intervals):
         seen.append((rest.begin, rest.thrust[0], rest.flow[0], rest.air))
         return solve(rocket, rest, guess, intervals)
 
-    monkeypatch.setattr(opponents, "optimise_rest", spy)
+    monkeypatch.setattr(guidance, "optimise_remaining", spy)
     assert (
-        ends(opponents.Replan(CUTOFF), z)["error_norm"][0]
+        ends(guidance.Replanning(CUTOFF), z)["error_norm"][0]
         < 2e-3
         < 5e-3
-        < ends(opponents.replay(CUTOFF), z)["error_norm"][0]
+        < ends(guidance.open_loop(CUTOFF), z)["error_norm"][0]
     )
     assert [begin for begin, *_ in seen] == [300.0, 400.0, 500.0, 600.0, 700.0, 800.0, 900.0]
     assert {what for _, *what in map(tuple, seen) for what in [tuple(what)]} == {
@@ -180,14 +183,14 @@ def test_a_failed_solve_keeps_the_last_plan(monkeypatch):
     def fail(*_):
         raise NoOptimum("none")
 
-    monkeypatch.setattr(opponents, "optimise_rest", fail)
-    z, law = evaluate.draws(ROCKET, 1.0, 5, 2), opponents.Replan(CUTOFF)
-    np.testing.assert_array_equal(ends(law, z)["final_y"], ends(opponents.replay(CUTOFF), z)["final_y"])
+    monkeypatch.setattr(guidance, "optimise_remaining", fail)
+    z, law = draws(ROCKET, 1.0, 5, 2), guidance.Replanning(CUTOFF)
+    np.testing.assert_array_equal(ends(law, z)["final_y"], ends(guidance.open_loop(CUTOFF), z)["final_y"])
     assert law.failed == len(law.seconds) > 50
 
 
 def test_the_optimum_that_knows_nothing_differs_is_the_reference():
-    (optimum,) = opponents.drawn_optima(CUTOFF, 1.0, np.zeros((1, SCORES)))
+    (optimum,) = guidance.drawn_optima(CUTOFF, 1.0, np.zeros((1, SCORES)))
     reference = rocket_reference(CUTOFF)
     assert optimum["final_mass"] == pytest.approx(reference["reference_mass_kg"], abs=1e-4)
     assert optimum["final_time"] == pytest.approx(reference["reference_time_s"], abs=1e-4)
@@ -196,18 +199,18 @@ def test_the_optimum_that_knows_nothing_differs_is_the_reference():
 @pytest.mark.parametrize("env_id", [CUTOFF, LEO])
 def test_the_optimum_of_a_draw_is_flown_by_the_environment(env_id):
     """To the target, with its mass; another flight's optimum misses: thrust, staging, drag and wind are the draw's."""
-    z = evaluate.draws(ROCKETS[env_id].rocket, 1.0, 5, 2)
-    optima = opponents.drawn_optima(env_id, 1.0, z)
-    own, other = (ends(opponents.fly_optima(env_id, plans), z, env_id) for plans in (optima, optima[::-1]))
+    z = draws(ROCKETS[env_id].rocket, 1.0, 5, 2)
+    optima = guidance.drawn_optima(env_id, 1.0, z)
+    own, other = (ends(guidance.fly_optima(env_id, plans), z, env_id) for plans in (optima, optima[::-1]))
     assert own["error_norm"].max() < 2e-4 < 1e-3 < other["error_norm"].min()
     np.testing.assert_allclose(own["final_mass_kg"], [optimum["final_mass"] for optimum in optima], rtol=2e-5)
 
 
 def test_to_the_orbit_reached_the_bound_holds():
     """A replay that misses is lighter than the optimum of its own draw and orbit, heavier perhaps than the target's."""
-    z = evaluate.draws(ROCKET, 1.0, 5, 3)
-    flown = ends(opponents.replay(CUTOFF), z)
-    optima = opponents.drawn_optima(CUTOFF, 1.0, z, flown["final_y"])
+    z = draws(ROCKET, 1.0, 5, 3)
+    flown = ends(guidance.open_loop(CUTOFF), z)
+    optima = guidance.drawn_optima(CUTOFF, 1.0, z, flown["final_y"])
     for optimum, y in zip(optima, flown["final_y"]):
         assert 0.998 < y[6] / optimum["final_mass"] < 1
         reached, planned = (envs.orbital_elements(state) for state in (y, optimum["y"][-1]))
@@ -219,10 +222,10 @@ def test_to_the_orbit_reached_the_bound_holds():
 
 @pytest.mark.parametrize("law", ["replay", "down"])
 def test_recorded_flights_give_the_metrics_again(law):
-    policy = opponents.replay(CUTOFF) if law == "replay" else lambda obs, t: -obs[:, :3]
-    metrics, arrays = evaluate.evaluate_dispersed(CUTOFF, policy, 4, 12, 6.0)
+    policy = guidance.open_loop(CUTOFF) if law == "replay" else lambda obs, t: -obs[:, :3]
+    metrics, arrays = evaluate_dispersed(CUTOFF, policy, 4, 12, 6.0)
     flights = comparison.recorded_flights(arrays, ROCKET, 6.0)
-    again = evaluate.dispersed_metrics(flights, ROCKET)
+    again = dispersed_metrics(flights, ROCKET)
     assert again.keys() == metrics.keys() - {"dispersion", "dispersed_starts"}
     assert all(again[key] == pytest.approx(metrics[key], rel=1e-12) for key in again)
     assert metrics["dispersed_crashed"] == (12 if law == "down" else 0)
@@ -241,10 +244,10 @@ def compared(tmp_path_factory):
 
     def fly_checkpoint(path, dispersion, eval_seed, n):
         """What a policy's process would give, without torch."""
-        _, arrays = evaluate.evaluate_dispersed(CUTOFF, opponents.replay(CUTOFF), eval_seed, n, dispersion)
+        _, arrays = evaluate_dispersed(CUTOFF, guidance.open_loop(CUTOFF), eval_seed, n, dispersion)
         return arrays, {"knows": comparison.knowledge({"dispersion": 1.0, "observe_draw": True}), "decision_us": 7.0}
 
-    solve, masses = opponents.drawn_optima, []
+    solve, masses = guidance.drawn_optima, []
 
     def drawn_optima(env_id, dispersion, z, reached=None, processes=1):
         optima = solve(env_id, dispersion, z, reached, processes)
@@ -254,21 +257,21 @@ def compared(tmp_path_factory):
         return optima
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(evaluate, "SUCCESS", HIT)
-        patch.setattr(opponents, "drawn_optima", drawn_optima)
-        patch.setattr(opponents, "REPLAN_EVERY", 200.0)
-        patch.setattr(opponents, "BOUND_SEGMENTS", 8)
+        patch.setattr(comparison, "SUCCESS", HIT)
+        patch.setattr(guidance, "drawn_optima", drawn_optima)
+        patch.setattr(guidance, "REPLAN_EVERY", 200.0)
+        patch.setattr(guidance, "DRAWN_SEGMENTS", 8)
         patch.setattr(comparison, "PROCESSES", 1)
         patch.setattr(comparison, "fly_checkpoint", fly_checkpoint)
         made, keep = [], comparison.Comparison.__init__
         patch.setattr(comparison.Comparison, "__init__", lambda self, *a: made.append(self) or keep(self, *a))
-        comparison.run(folder, 1.0, 6, 3, 3, [("again", folder / "agent.safetensors")])
+        comparison.compare(CUTOFF, folder, 1.0, 6, 3, 3, [("again", folder / "agent.safetensors")])
     return folder, made[0], np.reshape(masses, (-1, 3))
 
 
 def test_all_laws_fly_the_same_draws(compared):
     _, flown, _ = compared
-    z = evaluate.draws(ROCKET, 1.0, 3, 6)
+    z = draws(ROCKET, 1.0, 3, 6)
     assert set(flown.arrays) == {"policy", "again", *comparison.KNOWLEDGE}
     for name, arrays in flown.arrays.items():
         n = 3 if name in ("replan", "optimum") else 6
@@ -279,7 +282,7 @@ def test_a_policy_on_other_draws_is_refused(monkeypatch):
     """Its flights could not be set beside those of the laws."""
 
     def fly_checkpoint(path, dispersion, eval_seed, n):
-        return {"draw": evaluate.draws(ROCKET, dispersion, eval_seed + 1, n)}, {}
+        return {"draw": draws(ROCKET, dispersion, eval_seed + 1, n)}, {}
 
     monkeypatch.setattr(comparison, "fly_checkpoint", fly_checkpoint)
     flown = comparison.Comparison(CUTOFF, 1.0, 3, 10, 10)
@@ -370,13 +373,13 @@ def test_a_policys_process_flies_the_draws_that_were_asked_for():
 
     path, seed, dispersion = ROOT / "results" / "rocket_dispersed" / "agent.safetensors", 3, 2.0  # no flag's default
     arrays, about = comparison.fly_checkpoint(path, dispersion, seed, 10)
-    np.testing.assert_array_equal(arrays["draw"], evaluate.draws(ROCKET, dispersion, seed, 10))
+    np.testing.assert_array_equal(arrays["draw"], draws(ROCKET, dispersion, seed, 10))
     assert about["knows"] == "draws in training" and about["decision_us"] > 0
 
     argv = ["--eval-only", f"--checkpoint={path}"]
     args, _ = runs.parse_args(script.Args, argv, script.ENV_OPTIONS, script.BUFFERS)
     options = {name: getattr(args, name) for name in script.ENV_OPTIONS} | {"dispersion": dispersion}
-    env = envs.gym.make(CUTOFF, **options).unwrapped
+    env = gym.make(CUTOFF, **options).unwrapped
     agent = script.Agent(args, env.batch)
     agent.load_state_dict(safetensors.torch.load_file(path))
     for k in (0, 9):

@@ -161,7 +161,7 @@ def parse(*argv):
 def test_processes_fly_starts_of_their_own(monkeypatch):
     starts = []
     for rank in (0, 1):
-        monkeypatch.setattr(runs, "process", lambda rank=rank: (rank, 2))
+        monkeypatch.setattr(runs, "rank_and_world_size", lambda rank=rank: (rank, 2))
         envs = runs.make_envs(script.Args(num_envs=5), {})
         starts += envs.reset()[0][:, :2].tolist()
     assert len(starts) == 5 and len({x for start in starts for x in start}) == 10

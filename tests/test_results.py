@@ -11,7 +11,7 @@ import run_seeds
 import safetensors
 
 import envs
-import evaluate
+from common import curves
 
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "results"
@@ -58,7 +58,7 @@ def test_a_policy_was_trained_by_the_command_that_its_list_gives(folder, monkeyp
 def test_table_1_s_rocket_is_the_last_evaluation_of_its_curve():
     """And its table is that of all evaluations, with the sampled flights' median as it was printed then."""
     folder = RESULTS / "rocket_paper"
-    metrics, curve = json.loads((folder / "seeds/1.json").read_text()), evaluate.read_csv(folder / "seeds/1.csv")
+    metrics, curve = json.loads((folder / "seeds/1.json").read_text()), curves.read_csv(folder / "seeds/1.csv")
     for key in set(metrics) - {"env_id", "device", "torch_version"}:  # a curve holds no words
         assert curve[f"eval/{key}"][1][-1] == pytest.approx(float(metrics[key]), rel=1e-7), key
     sampled = dict(re.findall(r"update (\d+)/.* sampled error (\S+)  mean", (folder / "training.log").read_text()))

@@ -1,4 +1,4 @@
-"""The rocket's optima in rocket_baselines.py against published numbers, the maximum principle and their flights."""
+"""The rocket's optima in optimum.py against published numbers, the maximum principle and their flights."""
 
 import json
 import math
@@ -12,14 +12,14 @@ from zipfile import ZipFile
 
 import numpy as np
 import pytest
-import rocket_baselines
 from rocket_oracle import single_burn
 
 import baselines
 import envs
-from baselines import ASCENTS, STORED, nine_pitch_angles, rocket_reference
 from envs import ROCKET, ROCKETS, fly_rocket, rk4
 from envs import ascent as dynamics
+from rocket import optimum, report
+from rocket.optimum import ASCENTS, STORED, nine_pitch_angles, rocket_reference
 
 ROOT = Path(__file__).resolve().parents[1]
 KEYS = {"final_mass_kg", "final_time_s", "error_norm", "replay_error_norm", "solve_seconds", "status"}
@@ -37,7 +37,7 @@ def command(tmp_path_factory):
     args = baselines.parse_args(
         ["rocket", "--json", str(folder / "rocket_reference.json"), "--npz", str(folder / "rocket_reference.npz")]
     )
-    args.run(args)
+    baselines.save(args, *args.solve(args))
     numbers = json.loads((folder / "rocket_reference.json").read_text())
     with np.load(folder / "rocket_reference.npz") as file:
         return folder, numbers, dict(file)
@@ -45,7 +45,7 @@ def command(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def flights(command):
-    """What the npz holds, flown by the environment without anything from rocket_baselines.py."""
+    """What the npz holds, flown by the environment without anything from optimum.py."""
     _, _, arrays = command
     return {key: fly(arrays, key) for key in VEHICLES}
 
@@ -80,7 +80,7 @@ def test_thrust_is_parallel_to_the_costate_of_the_velocity(command):
 
 def test_pontryagin_angle_sees_an_error():
     u = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])
-    angle = baselines.pontryagin_angle({"u": u, "costate": 7.0 * np.array([[1.0, 0, 0], [0, -1, 0], [1, 0, 1]])})
+    angle = report.pontryagin_angle({"u": u, "costate": 7.0 * np.array([[1.0, 0, 0], [0, -1, 0], [1, 0, 1]])})
     np.testing.assert_allclose(angle, [0, 180, 45])
 
 
@@ -99,8 +99,8 @@ def test_drag_costs_mass(command):
 
 def test_solving_twice_gives_the_same_bits(command):
     _, numbers, arrays = command
-    baselines.solve_ascent.cache_clear()
-    again, flight, _ = baselines.solve_ascent(ASCENTS["free"])
+    optimum.solve_ascent.cache_clear()
+    again, flight, _ = optimum.solve_ascent(ASCENTS["free"])
     assert {**again, "solve_seconds": 0} == {**numbers["free"], "solve_seconds": 0}
     np.testing.assert_array_equal(flight["u"], arrays["free_u"])
 
@@ -108,9 +108,9 @@ def test_solving_twice_gives_the_same_bits(command):
 def test_optimum_for_the_orbit_reached():
     """For the target's own elements it is the known optimum; a lower apogee, with the same perigee, leaves more."""
     elements = {"a_km": 24361.14, "e": 0.7308, "i_deg": 28.5, "raan_deg": 269.8, "argp_deg": 130.5}
-    assert baselines.reached_optimum(elements)["final_mass"] == pytest.approx(7529.712296, rel=1e-8)
+    assert optimum.reached_optimum(elements)["final_mass"] == pytest.approx(7529.712296, rel=1e-8)
     lower = elements | {"a_km": 24361.14 - 100, "e": 1 - 24361.14 * (1 - 0.7308) / (24361.14 - 100)}
-    assert 7530 < baselines.reached_optimum(lower)["final_mass"] < 7550
+    assert 7530 < optimum.reached_optimum(lower)["final_mass"] < 7550
 
 
 # --- flights ----------------------------------------------------------------------------------------------------------
@@ -169,7 +169,7 @@ def shipped(command, tmp_path, monkeypatch):
     """A copy of the command's files in the place of results/."""
     for path in command[0].iterdir():
         (tmp_path / path.name).write_bytes(path.read_bytes())
-    monkeypatch.setattr(rocket_baselines, "RESULTS", tmp_path)
+    monkeypatch.setattr(optimum, "RESULTS", tmp_path)
     return tmp_path
 
 
@@ -179,7 +179,7 @@ def refuse(case):
 
 @pytest.mark.parametrize("env_id", ["RocketAscent-v0", "RocketAscentCutoff-v0", "TwoStageLEO-v0"])
 def test_reference_is_the_solve(command, flights, shipped, monkeypatch, env_id):
-    monkeypatch.setattr(rocket_baselines, "solve_ascent", refuse)
+    monkeypatch.setattr(optimum, "solve_ascent", refuse)
     _, numbers, _ = command
     key, found = STORED.get(env_id, env_id), rocket_reference(env_id)
     assert found["reference_mass_kg"] == numbers[key]["final_mass_kg"]
@@ -241,7 +241,7 @@ def test_reference_is_solved_anew_where_the_files_do_not_serve(command, flights,
         solved.append(case.key)
         return command[1][case.key], flights[case.key], None
 
-    monkeypatch.setattr(rocket_baselines, "solve_ascent", solve)
+    monkeypatch.setattr(optimum, "solve_ascent", solve)
     found = rocket_reference("RocketAscentCutoff-v0")
     assert solved == ["free"] and found["error_norm"] < 2e-5
     assert found["reference_mass_kg"] == command[1]["free"]["final_mass_kg"]
@@ -251,11 +251,11 @@ def test_reference_is_solved_anew_where_the_files_do_not_serve(command, flights,
 def test_results_hold_the_command_s_files(command):
     """What is shipped in results/ is what the command gives; up to rounding on another machine."""
     _, numbers, arrays = command
-    kept = json.loads((baselines.RESULTS / "rocket_reference.json").read_text())
+    kept = json.loads((optimum.RESULTS / "rocket_reference.json").read_text())
     assert kept.keys() <= numbers.keys()
     for key in VEHICLES:
         assert kept[key]["final_mass_kg"] == pytest.approx(numbers[key]["final_mass_kg"], rel=1e-9)
-    with np.load(baselines.RESULTS / "rocket_reference.npz") as file:
+    with np.load(optimum.RESULTS / "rocket_reference.npz") as file:
         assert set(file) <= set(arrays)
         for key in FREE:
             np.testing.assert_allclose(file[f"{key}_t"], arrays[f"{key}_t"], rtol=0, atol=1e-5)
@@ -303,11 +303,11 @@ def test_yaw_is_flown_where_the_optimum_has_some(flights):
 def test_pitch_times_are_nine():
     """The paper's four burns, then fewer: the longest gaps are halved; every staging of the rocket is among them."""
     np.testing.assert_allclose(
-        baselines.pitch_times(ROCKET, 924.0), [0, 30, 75.2, 150.4, 261, 426.75, 592.5, 758.25, 924]
+        optimum.pitch_times(ROCKET, 924.0), [0, 30, 75.2, 150.4, 261, 426.75, 592.5, 758.25, 924]
     )
     # 0, 30, 162, 258, 354, 450, 546 by the rule; then 30 to 162 and the first of the last burn's quarters are halved
-    np.testing.assert_allclose(baselines.pitch_times(LEO, 546.0), [0, 30, 96, 162, 210, 258, 354, 450, 546])
-    times = baselines.pitch_times(single_burn(), 300.0)
+    np.testing.assert_allclose(optimum.pitch_times(LEO, 546.0), [0, 30, 96, 162, 210, 258, 354, 450, 546])
+    times = optimum.pitch_times(single_burn(), 300.0)
     assert len(times) == 9 and (np.diff(times) > 0).all() and times[0] == 0 and times[-1] == 300
     assert {30, 75, 150, 225} < set(times)
 
@@ -316,30 +316,30 @@ def test_pitch_times_are_nine():
     "rocket, end", [(ROCKET, 900.0), (LEO, 521.7), (replace(ROCKET, end_time=850.0), 799.0), (single_burn(), 235.0)]
 )
 def test_guesses_end_within_the_last_burn_and_the_flight(rocket, end):
-    guesses = baselines.ascent_guesses(rocket)
+    guesses = optimum.ascent_guesses(rocket)
     assert guesses[0][0] == pytest.approx(end) and len(guesses) == 3
     for final_time, tilt_time in guesses:
         assert rocket.last_ignition < final_time < rocket.end_time and 0 < tilt_time < final_time
     # a last burn that is short or begins late
     burns = (*rocket.burns[:-1], replace(rocket.burns[-1], end=rocket.last_ignition + 20.0))
     short = replace(rocket, burns=burns, end_time=burns[-1].end)
-    assert all(short.last_ignition < final_time < short.end_time for final_time, _ in baselines.ascent_guesses(short))
+    assert all(short.last_ignition < final_time < short.end_time for final_time, _ in optimum.ascent_guesses(short))
 
 
 def test_final_time_is_bounded_by_the_flights_end():
     """Below the optimum's 924 s there is an optimum no more; above it the bound does not touch it."""
-    case = baselines.Ascent("short", replace(ROCKET, end_time=930.0))
-    assert baselines.collocation_mesh(case, 900.0, 80).final_time == (261.0, 930.0)
-    assert baselines.optimise_ascent(case)["final_time"] == pytest.approx(924.1392, abs=1e-3)
+    case = optimum.AscentCase("short", replace(ROCKET, end_time=930.0))
+    assert optimum.collocation_mesh(case, 900.0, 80).final_time == (261.0, 930.0)
+    assert optimum.optimise_ascent(case)["final_time"] == pytest.approx(924.1392, abs=1e-3)
 
 
 def test_ceiling_is_the_missions():
     """With fixed time the reference stays below it; with cut-off, and without a ceiling, there is no bound."""
     fixed, cutoff = ROCKETS["RocketAscent-v0"], ROCKETS["RocketAscentCutoff-v0"]
-    assert baselines.mission_ascent("fixed_capped", fixed) == ASCENTS["fixed_capped"]
-    assert baselines.mission_ascent("free", cutoff) == ASCENTS["free"]
-    assert baselines.mission_ascent("fixed", replace(fixed, ceiling_km=None)) == ASCENTS["fixed"]
-    assert baselines.mission_ascent("lower", replace(fixed, ceiling_km=240.0)).ceiling == 240e3
+    assert optimum.mission_case("fixed_capped", fixed) == ASCENTS["fixed_capped"]
+    assert optimum.mission_case("free", cutoff) == ASCENTS["free"]
+    assert optimum.mission_case("fixed", replace(fixed, ceiling_km=None)) == ASCENTS["fixed"]
+    assert optimum.mission_case("lower", replace(fixed, ceiling_km=240.0)).ceiling == 240e3
 
 
 @pytest.mark.parametrize("ceiling_km", [None, 260.0])
@@ -347,9 +347,7 @@ def test_another_ceiling_is_another_reference(monkeypatch, flights, ceiling_km):
     """The paper's id with another ceiling, or none, does not find the stored optimum below 250 km."""
     solved = []
     numbers = {"final_mass_kg": 6644.0, "final_time_s": 961.0}
-    monkeypatch.setattr(
-        rocket_baselines, "solve_ascent", lambda case: solved.append(case) or (numbers, flights["fixed"], None)
-    )
+    monkeypatch.setattr(optimum, "solve_ascent", lambda case: solved.append(case) or (numbers, flights["fixed"], None))
     monkeypatch.setitem(ROCKETS, "RocketAscent-v0", replace(ROCKETS["RocketAscent-v0"], ceiling_km=ceiling_km))
     found = rocket_reference("RocketAscent-v0")
     assert found["max_altitude_km"] > 250.1, "the flight without a ceiling"
@@ -359,7 +357,7 @@ def test_another_ceiling_is_another_reference(monkeypatch, flights, ceiling_km):
 @pytest.mark.parametrize("changed", [{"cutoff": False}, {"cutoff": False, "ceiling_km": 300.0}])
 def test_another_rule_of_a_vehicle_is_another_reference(monkeypatch, changed):
     """Its stored optimum still reaches the orbit: earlier than at the end time, and above the ceiling."""
-    monkeypatch.setattr(rocket_baselines, "solve_ascent", refuse)
+    monkeypatch.setattr(optimum, "solve_ascent", refuse)
     env_id = "TwoStageLEO-v0"
     rocket_reference(env_id)
     monkeypatch.setitem(ROCKETS, env_id, replace(ROCKETS[env_id], **changed))
@@ -370,9 +368,7 @@ def test_another_rule_of_a_vehicle_is_another_reference(monkeypatch, changed):
 def test_options_change_what_is_solved(monkeypatch, flights):
     solved = []
     numbers = {"final_mass_kg": 7000.0, "final_time_s": 924.0}
-    monkeypatch.setattr(
-        rocket_baselines, "solve_ascent", lambda case: solved.append(case) or (numbers, flights["free"], None)
-    )
+    monkeypatch.setattr(optimum, "solve_ascent", lambda case: solved.append(case) or (numbers, flights["free"], None))
     mine = replace(ROCKET, payload=4000.0)
     rocket_reference("RocketAscentCutoff-v0", rocket=mine)
     rocket_reference("RocketAscentCutoff-v0", table_isp=True)
@@ -389,9 +385,9 @@ def test_options_change_what_is_solved(monkeypatch, flights):
 )
 def test_an_infeasible_ascent_is_an_error_of_one_line(changes, names):
     """It says what to look at; 334.5108 is -arcsin(tan 28.5 / tan 51.6) in degrees."""
-    case = baselines.Ascent("heavy", replace(LEO, **changes))
+    case = optimum.AscentCase("heavy", replace(LEO, **changes))
     with pytest.raises(RuntimeError) as error:
-        baselines.optimise_ascent(case, 8)
+        optimum.optimise_ascent(case, 8)
     message = str(error.value)
     assert re.match("^rocket ascent heavy: IPOPT stopped with [A-Za-z_]+, from every guess: ", message)
     assert chr(10) not in message and all(name in message for name in [*names, "334.5108", "its i, 51.6"])
@@ -399,22 +395,22 @@ def test_an_infeasible_ascent_is_an_error_of_one_line(changes, names):
 
 def test_a_rocket_without_the_energy_is_refused_before_any_solve(monkeypatch):
     """Its delta-v by Tsiolkovsky: 3.0 and 3.4 km/s times the mass ratios' logarithms, and 359 m/s of turning Earth."""
-    monkeypatch.setattr(rocket_baselines, "ascend", None)
+    monkeypatch.setattr(optimum, "ascend", None)
     m0 = 433e3 + 111.5e3 + 45e3
     delta_v = 7.6e6 * 162 / 411e3 * math.log(m0 / (m0 - 411e3))
     delta_v += 934e3 * 393 / 107.5e3 * math.log((111.5e3 + 45e3) / (4e3 + 45e3))
     speed = round(delta_v + 7.29211585e-5 * 6378145 * math.cos(math.radians(28.5)))
     message = f"^rocket ascent heavy: .* {speed} m/s, .*; look at its payload, 45000.0 kg$"
     with pytest.raises(RuntimeError, match=message):
-        baselines.optimise_ascent(baselines.Ascent("heavy", replace(LEO, payload=45e3)))
+        optimum.optimise_ascent(optimum.AscentCase("heavy", replace(LEO, payload=45e3)))
 
 
 def test_a_flight_that_misses_is_an_error(flights, monkeypatch):
     early = {"u": flights["fixed"]["u"], "final_time": 960.0}
-    monkeypatch.setattr(rocket_baselines, "ascend", lambda case, mesh, guess: early)
-    baselines.solve_ascent.cache_clear()
+    monkeypatch.setattr(optimum, "ascend", lambda case, mesh, guess: early)
+    optimum.solve_ascent.cache_clear()
     with pytest.raises(RuntimeError, match="rocket ascent fixed: flown by the environment it misses by 0.0"):
-        baselines.solve_ascent(ASCENTS["fixed"])
+        optimum.solve_ascent(ASCENTS["fixed"])
 
 
 def test_nothing_is_written_unless_asked(tmp_path, monkeypatch):

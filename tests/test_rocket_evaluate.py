@@ -5,14 +5,19 @@ import json
 import math
 import sys
 
-import animation
-import figures
 import numpy as np
 import pytest
+from helpers import figure_of, headline_of, table_of
 from test_evaluate import command_line, snapshot
 
 import envs
 import evaluate
+from common.files import write_json, write_npz
+from common.tasks import task_of
+from drawing import animation
+from rocket import optimum
+from rocket.figures import pitch_and_yaw, target_points
+from rocket.metrics import rocket_metrics
 
 FIXED, CUTOFF, LEO = IDS = ["RocketAscent-v0", "RocketAscentCutoff-v0", "TwoStageLEO-v0"]
 MU, RE = 3.986012e14, 6378145.0
@@ -151,9 +156,9 @@ def test_keys_are_exactly_the_interfaces_and_plain(flown, env_id, tmp_path):
     assert (metrics["env_id"], metrics["eval_seed"], metrics["eval_starts"]) == (env_id, 3, 1)
     assert {type(value) for value in metrics.values()} == {str, int, float, bool}
     assert {key for key, value in metrics.items() if type(value) is bool} == {"success", "crashed"}
-    evaluate.write_json(tmp_path / "eval.json", metrics)
+    write_json(tmp_path / "eval.json", metrics)
     assert json.loads((tmp_path / "eval.json").read_text()) == metrics
-    evaluate.write_npz(tmp_path / "eval.npz", arrays)
+    write_npz(tmp_path / "eval.npz", arrays)
     with np.load(tmp_path / "eval.npz") as file:
         assert all(np.array_equal(file[key], arrays[key]) for key in ARRAYS)
 
@@ -247,7 +252,7 @@ def test_reward_parts_equal_plain_loops(flown, env_id):
 @pytest.mark.parametrize("ours, error", [(269.9, 0.1), (0.5, 90.7), (89.7, 179.9), (90.0, -179.8), (268.8, -1.0)])
 def test_angles_differ_the_short_way_round(references, ours, error):
     flight = references[CUTOFF] | {"raan_deg": ours}
-    metrics = evaluate.rocket_metrics(flight, references[CUTOFF], envs.ROCKETS[CUTOFF])
+    metrics = rocket_metrics(flight, references[CUTOFF], envs.ROCKETS[CUTOFF])
     assert metrics["raan_error_deg"] == pytest.approx(error, abs=1e-9)
 
 
@@ -259,7 +264,7 @@ def hyperbolic(references):
     flight |= elements(flight["y"][-1]) | {"error_norm": np.float64(norm(errors(flight["y"][-1])))}
     assert flight["a_km"] < 0 and flight["e"] > 1
     metrics = {"env_id": FIXED, "eval_seed": 0, "eval_starts": 1}
-    metrics |= evaluate.rocket_metrics(flight, references[FIXED], envs.ROCKETS[FIXED])
+    metrics |= rocket_metrics(flight, references[FIXED], envs.ROCKETS[FIXED])
     arrays = {
         f"{key}{side}": run[key] for key in "tuy" for side, run in (("", flight), ("_reference", references[FIXED]))
     }
@@ -271,10 +276,10 @@ def test_hyperbola_has_no_apogee(hyperbolic, tmp_path):
     assert metrics.keys() == KEYS - {"apogee_km"} and not metrics["success"]
     h, e = vectors(arrays["y"][-1])
     assert metrics["perigee_km"] == pytest.approx((dot(h, h) / MU / (1 + norm(e)) - RE) / 1e3, rel=1e-9)
-    evaluate.write_json(tmp_path / "eval.json", metrics)
-    (row,) = (line for line in evaluate.table(metrics).splitlines() if "apogee" in line)
+    write_json(tmp_path / "eval.json", metrics)
+    (row,) = (line for line in table_of(metrics).splitlines() if "apogee" in line)
     assert row.split()[-2:] == ["-", "-"]
-    figure = figures.draw_orbit(arrays, metrics)
+    figure = figure_of("orbit.png", arrays, metrics)
     reached = lines_of(figure.axes[0])["orbit reached"]
     assert np.isnan(reached).any() and np.isfinite(reached).any()
 
@@ -285,29 +290,29 @@ def test_crash(crashed):
     assert metrics["crashed"] and not metrics["success"]
     assert metrics["R_penalties"] == pytest.approx(-40 * (2 - metrics["final_time_s"] / 961))
     assert norm(arrays["y"][-1, :3]) < RE and metrics["perigee_km"] < -6000
-    table = evaluate.table(metrics)
+    table = table_of(metrics)
     assert "crashed" in table and "nan" not in table and "inf" not in table
     assert table_row(table, "lowest altitude after 300 s (km)")[2:] == ["-", "-"]
-    assert "crashed" in figures.headline(metrics)
+    assert "crashed" in headline_of(metrics)
 
 
-def test_missing_reference_is_asked_for_once_and_options_reach_the_environment(monkeypatch, references):
-    asked, seen = [], []
+def test_missing_reference_is_asked_for_once_and_options_reach_the_environment(monkeypatch):
+    asked, seen, stored = [], [], optimum.stored_reference
 
-    def reference(env_id, **options):
+    def reference(env_id, case):
         asked.append(env_id)
-        return references[env_id]
+        return stored(env_id, case)
 
     def policy(obs, step):
         seen.append(obs[0])
         return np.array([[1.0, 0.0, 0.0]])  # up: with action_frame="local" only
 
-    monkeypatch.setattr(evaluate.baselines, "rocket_reference", reference, raising=False)
-    evaluate.optimum.cache_clear()
+    monkeypatch.setattr(optimum, "stored_reference", reference)
+    optimum.kept_reference.cache_clear()
     for seed, n in ((1, 10), (2, 50)):
         metrics, arrays = evaluate.evaluate(CUTOFF, policy, seed, n, action_frame="local", observe_phase=False)
-        assert metrics["eval_seed"] == seed and metrics["reference_mass_kg"] == references[CUTOFF]["reference_mass_kg"]
-    evaluate.optimum.cache_clear()
+        assert metrics["eval_seed"] == seed and metrics["reference_mass_kg"] == pytest.approx(7529.712296, abs=1e-6)
+    optimum.kept_reference.cache_clear()
     assert asked == [CUTOFF]
     assert not np.array(seen)[:, 7:].any()
     radial = arrays["y"][:-1, :3] / np.linalg.norm(arrays["y"][:-1, :3], axis=1)[:, None]
@@ -341,7 +346,7 @@ def table_row(table, label):
 def test_table_shows_target_optimum_ours_and_difference(flown, env_id):
     target = TARGETS[env_id]
     metrics = json.loads(json.dumps(flown[env_id][0]))  # eval.json is all it needs
-    table = evaluate.table(metrics)
+    table = table_of(metrics)
     assert table.splitlines()[0].startswith(env_id)
     assert table.splitlines()[1].split() == ["target", "optimum", "ours", "difference"]
     perigee, apogee = (target["a_km"] * (1 + sign * target["e"]) - 6378.145 for sign in (-1, 1))
@@ -378,39 +383,39 @@ def test_mass_for_the_orbit_reached(flown, monkeypatch):
     """For the target's own elements the optimum is the known one; what is compared with it is our final mass."""
     metrics = flown[CUTOFF][0] | PAPER
     pytest.importorskip("casadi")
-    assert metrics["success"] and evaluate.mass_reached(metrics) == pytest.approx(
+    assert metrics["success"] and task_of(CUTOFF).reported_metrics(metrics) == pytest.approx(
         {"mass_ratio_reached": metrics["final_mass_kg"] / 7529.712296, "reference_mass_reached_kg": 7529.712296},
         rel=1e-8,
     )
-    assert evaluate.mass_reached(metrics | {"success": False}) == {}
-    assert evaluate.mass_reached(metrics | {"env_id": FIXED}) == {}
-    assert evaluate.mass_reached({"env_id": "DoubleIntegrator-v0"}) == {}
+    assert task_of(CUTOFF).reported_metrics(metrics | {"success": False}) == {}
+    assert task_of(FIXED).reported_metrics(metrics | {"env_id": FIXED}) == {}
+    assert task_of("DoubleIntegrator-v0").reported_metrics({"env_id": "DoubleIntegrator-v0"}) == {}
     monkeypatch.setitem(sys.modules, "casadi", None)  # as if it were not installed
-    assert evaluate.mass_reached(metrics) == {}
+    assert task_of(CUTOFF).reported_metrics(metrics) == {}
 
 
 def test_an_orbit_without_an_optimum_has_no_mass_ratio(flown, monkeypatch):
     def stop(flight, rocket):
         raise RuntimeError("rocket ascent reached: IPOPT stopped with Infeasible_Problem_Detected")
 
-    monkeypatch.setattr(evaluate.baselines, "reached_optimum", stop)
-    assert evaluate.mass_reached(flown[CUTOFF][0]) == {}
+    monkeypatch.setattr("rocket.task.reached_optimum", stop)
+    assert task_of(CUTOFF).reported_metrics(flown[CUTOFF][0]) == {}
 
 
 def test_texts_lead_with_the_mass_for_the_orbit_reached(flown, crashed, tmp_path):
     metrics = flown[CUTOFF][0]
-    plain = evaluate.table(metrics)
+    plain = table_of(metrics)
     assert REACHED not in plain and plain.count("a is exact because of this rule") == 1
-    assert "a is exact" not in evaluate.table(flown[FIXED][0]) + evaluate.table(crashed[0])
+    assert "a is exact" not in table_of(flown[FIXED][0]) + table_of(crashed[0])
     metrics = metrics | {"mass_ratio_reached": 0.987654, "reference_mass_reached_kg": 7654.321}
-    table = evaluate.table(metrics)
+    table = table_of(metrics)
     assert table.index(REACHED) < table.index(TARGET_ORBIT) and "7654.321 kg" in table
     assert table_row(table, REACHED) == ["-", "1.000000", "0.987654", "-0.012346"]
     assert float(table_row(table, TARGET_ORBIT)[2]) == pytest.approx(metrics["mass_ratio"], abs=1e-6)
-    assert figures.headline(metrics).endswith("optimum for the orbit reached 7654.3 kg")
+    assert headline_of(metrics).endswith("optimum for the orbit reached 7654.3 kg")
     (tmp_path / "seeds").mkdir()
     for seed, run in ((1, metrics), (2, flown[CUTOFF][0])):
-        evaluate.write_json(tmp_path / "seeds" / f"{seed}.json", run | {"seed": seed})
+        write_json(tmp_path / "seeds" / f"{seed}.json", run | {"seed": seed})
     (line,) = (line for line in evaluate.seed_lines(tmp_path) if "for the orbit reached" in line)
     assert line.split()[-5:] == ["0.9877", "-", "0.9877", "0.9877", "0.9877"]  # seed 1, seed 2, median, range
 
@@ -428,7 +433,7 @@ def lines_of(ax):
 @pytest.mark.parametrize("env_id", [CUTOFF, LEO])
 def test_ascent_figure_shows_both_flights(flown, env_id):
     metrics, arrays = flown[env_id]
-    figure = figures.draw_ascent(arrays, metrics)
+    figure = figure_of("trajectory.png", arrays, metrics)
     panels = {ax.get_ylabel(): ax for ax in figure.axes}
     assert len(panels) == len(figure.axes) == 14
     altitude, other = ([(norm(row[:3]) - RE) / 1e3 for row in arrays[key]] for key in ("y", "y_reference"))
@@ -462,7 +467,7 @@ def test_ascent_figure_shows_both_flights(flown, env_id):
 @pytest.mark.parametrize("env_id", [CUTOFF, LEO])
 def test_pitch_and_yaw_are_the_programmes(flown, env_id):
     _, arrays = flown[env_id]
-    pitch, yaw = figures.pitch_and_yaw(arrays["u"], arrays["y"], envs.ROCKETS[env_id].rocket)
+    pitch, yaw = pitch_and_yaw(arrays["u"], arrays["y"], envs.ROCKETS[env_id].rocket)
     flown_pitch = np.interp(arrays["t"][:-1], TIMES_OF[env_id], BY_HAND_OF[env_id])
     flown_yaw = np.interp(arrays["t"][:-1], *WEAVE)
     assert pitch == pytest.approx(flown_pitch, abs=1e-6)
@@ -474,7 +479,7 @@ def test_pitch_and_yaw_are_the_programmes(flown, env_id):
 @pytest.mark.parametrize("env_id", [CUTOFF, LEO])
 def test_orbit_figure_shows_orbits_insertion_and_ground_track(flown, env_id):
     metrics, arrays = flown[env_id]
-    figure = figures.draw_orbit(arrays, metrics)
+    figure = figure_of("orbit.png", arrays, metrics)
     plane, insertion, ground = figure.axes
     lines, target, y = lines_of(plane), TARGETS[env_id], arrays["y"]
     frame, (a, e) = target_frame(target), (target["a_km"] / 1e3, target["e"])
@@ -487,7 +492,7 @@ def test_orbit_figure_shows_orbits_insertion_and_ground_track(flown, env_id):
     assert west < min(low[0], -earth) and east > max(high[0], earth), "both are drawn whole"
     assert south < min(low[1], -earth) and north > max(high[1], earth)
     assert lines["policy"] == pytest.approx((y[:, :3] @ frame[:2].T) / 1e6)
-    for r in figures.target_points(envs.ROCKETS[env_id].rocket):  # the conic's equation: r = p - e x
+    for r in target_points(envs.ROCKETS[env_id].rocket):  # the conic's equation: r = p - e x
         assert norm(r) == pytest.approx(1e3 * a * (1 - e**2) - e * (r @ frame[0]))
     distance = np.hypot(*(lines["orbit reached"] - lines["policy"][-1]).T)
     assert distance.min() < 0.02  # 1000 km: it passes through the last state
@@ -520,8 +525,8 @@ def curve(level=0.0, evaluations=True):
 
 
 def test_training_figure_shows_the_error_and_no_outlier(flown):
-    metrics, _ = flown[CUTOFF]
-    figure = figures.draw_training([curve(), curve(-1.0)], metrics)
+    metrics, arrays = flown[CUTOFF]
+    figure = figure_of("training.png", arrays, metrics, [curve(), curve(-1.0)])
     returns, policy_loss, total_loss, error = figure.axes
     assert error.get_yscale() == "log" and 0.02 in [line.get_ydata()[0] for line in error.lines]
     assert "error" in error.get_ylabel()
@@ -532,12 +537,12 @@ def test_training_figure_shows_the_error_and_no_outlier(flown):
     assert blue.get_ydata()[0] == metrics["reference_episodic_return"]
     last_returns = [line.get_ydata()[-1] for line in returns.lines]
     assert max(last_returns) > 26, "the evaluations' return, not the training's 20, which has its noise"
-    assert len(figures.draw_training([curve(evaluations=False)], metrics).axes) == 3
+    assert len(figure_of("training.png", arrays, metrics, [curve(evaluations=False)]).axes) == 3
 
 
 def test_crash_can_be_drawn(crashed):
     metrics, arrays = crashed
-    for figure in (figures.draw_ascent(arrays, metrics), figures.draw_orbit(arrays, metrics)):
+    for figure in (figure_of("trajectory.png", arrays, metrics), figure_of("orbit.png", arrays, metrics)):
         assert "crashed" in figure.get_suptitle()
 
 
@@ -558,8 +563,8 @@ def make_run(folder, flight, seed=1, level=0.0, **changes):
     (folder / "agent.safetensors").write_bytes(b"weights of seed %d" % seed)
     digest = hashlib.sha256((folder / "agent.safetensors").read_bytes()).hexdigest()
     metrics, arrays = flight
-    evaluate.write_json(folder / "eval.json", {**metrics, "seed": seed, "checkpoint_sha256": digest, **changes})
-    evaluate.write_npz(folder / "eval.npz", arrays)
+    write_json(folder / "eval.json", {**metrics, "seed": seed, "checkpoint_sha256": digest, **changes})
+    write_npz(folder / "eval.npz", arrays)
     return folder
 
 

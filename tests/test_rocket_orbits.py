@@ -9,16 +9,8 @@ import pytest
 import spiceypy
 from rocket_oracle import MU, PAPER, RE, both, rotation
 
-from envs import (
-    ROCKET,
-    ROCKETS,
-    OrbitalElements,
-    launch_raan,
-    orbital_elements,
-    target_axes,
-    target_orbit,
-    terminal_error,
-)
+from envs import ROCKET, ROCKETS, launch_raan, orbital_elements, target_axes, target_orbit, terminal_error
+from rocket.vehicle import OrbitalElements
 
 # --- orbital elements -------------------------------------------------------------------------------------------------
 

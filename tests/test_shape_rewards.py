@@ -8,7 +8,8 @@ import pytest
 import torch
 
 import ppo_gtrxl_rocket as script
-from envs import ROCKET, mass_rewards, terminal_reward
+from envs import ROCKET
+from rocket.rewards import mass_rewards, terminal_reward
 
 ROOT = Path(__file__).resolve().parents[1]
 N = 32
@@ -150,8 +151,8 @@ def test_several_processes_pay_what_one_pays(dispersion, monkeypatch):
     """Each its own flights, by the fit to all flights of one start; 8 of 32 are the first process's."""
     episodes, flags = flights(), {"dispersion": dispersion, "flights_per_start": 8}
     whole = at_the_end(paid(episodes, **flags))
-    monkeypatch.setattr(script.runs, "gathered", lambda count: [8, 24])
+    monkeypatch.setattr(script.runs, "all_gather", lambda count: [8, 24])
     for rank, part in ((0, slice(8)), (1, slice(8, None))):
-        monkeypatch.setattr(script.runs, "process", lambda rank=rank: (rank, 2))
+        monkeypatch.setattr(script.runs, "rank_and_world_size", lambda rank=rank: (rank, 2))
         rewards = at_the_end(paid(episodes, flying=len(whole[part]), **flags))
         np.testing.assert_array_equal(rewards, whole[part])

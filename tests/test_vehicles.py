@@ -10,19 +10,23 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-import figures
 import gymnasium as gym
 import numpy as np
 import pytest
-import rocket_baselines
 import spiceypy
+from helpers import figure_of, table_of
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from rocket_oracle import CUTOFF, FIXED, LEO, MU, RE, single_burn
 
 import baselines
 import envs
 import evaluate
-from envs import BOOSTER, ROCKET, ROCKETS, BadInput, Burn, Engine, Rocket, register_rocket
+from common.tasks import task_of
+from envs import ROCKET, ROCKETS, BadInput, Burn, Engine, Rocket, register_rocket
+from rocket import optimum
+from rocket.metrics import rocket_metrics
+from rocket.table import table as rocket_table
+from rocket.vehicle import BOOSTER
 
 ROOT = Path(__file__).resolve().parents[1]
 TWO = ROCKETS[LEO].rocket
@@ -39,7 +43,7 @@ def restored():
         for registry, before in ((ROCKETS, missions), (gym.registry, specs)):
             registry.clear()
             registry.update(before)
-        evaluate.optimum.cache_clear()
+        optimum.kept_reference.cache_clear()
 
 
 @pytest.fixture(autouse=True)
@@ -69,7 +73,7 @@ REFUSED = {
     "a mission's ceiling_km is nan; it must be positive": lambda: envs.Mission(two_stages(), ceiling_km=np.nan),
     "a mission's mass_unit is -5; it must be positive": lambda: envs.Mission(two_stages(), mass_unit=-5),
     "a mission's guided_until is 0; it must be positive": lambda: envs.Mission(two_stages(), guided_until=0),
-    "a mission's late is None; it must be a finite": lambda: envs.Mission(two_stages(), late=None),
+    "a mission's floor_from is None; it must be a finite": lambda: envs.Mission(two_stages(), floor_from=None),
     "a burn's engines is (1, Engine(": lambda: Burn(162.0, (1, FIRST)),
     "a burn's dropped is ": lambda: Burn(162.0, ((1, FIRST),), dropped=[(1, FIRST)]),
     "a rocket's a is 6778.145 m": lambda: replace(TWO, a=6778.145),
@@ -207,18 +211,18 @@ def test_foreign_ids_are_refused(env_id):
 def test_registering_again_replaces(monkeypatch):
     """Environment, reference and evaluation are the new rocket's, with a warning where it is another one."""
     solved = []
-    monkeypatch.setattr(rocket_baselines, "solve_ascent", lambda case: solved.append(case.rocket) or 1 / 0)
+    monkeypatch.setattr(optimum, "solve_ascent", lambda case: solved.append(case.rocket) or 1 / 0)
     lighter = replace(TWO, payload=19e3)
     for rocket in (TWO, lighter):
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            register_rocket("Again-v0", rocket, cutoff=True, late=200.0)
+            register_rocket("Again-v0", rocket, cutoff=True, floor_from=200.0)
         said = [str(warning.message) for warning in caught]
         assert said == (
             ["Again-v0 was another rocket's id; from here on it is this one's"] if rocket is lighter else []
         )
         assert gym.make_vec("Again-v0", num_envs=2).unwrapped.rocket == rocket
-        assert gym.make("Again-v0").unwrapped.batch.mission.late == 200.0
+        assert gym.make("Again-v0").unwrapped.batch.mission.floor_from == 200.0
         with pytest.raises(ZeroDivisionError):
             evaluate.evaluate("Again-v0", lambda obs, t: np.ones((1, 3)), 0, 1)
     assert solved == [TWO, lighter]
@@ -230,12 +234,12 @@ def test_registering_again_replaces(monkeypatch):
 
 def test_evaluation_does_not_keep_the_optimum_of_a_replaced_rocket(monkeypatch):
     flight = envs.fly_rocket(LEO, lambda obs, t: np.ones((1, 3)), end_time=10.0)
-    numbers = {"reference_time_s": 1.0, "nine_pitch_error_norm": 1.0}
 
-    def reference(env_id, **options):
-        return flight | numbers | {"reference_mass_kg": ROCKETS[env_id].rocket.payload}
+    def solve(case):
+        return {"final_mass_kg": case.rocket.payload, "final_time_s": 1.0}, flight, None
 
-    monkeypatch.setattr(baselines, "rocket_reference", reference)
+    monkeypatch.setattr(optimum, "solve_ascent", solve)
+    monkeypatch.setattr(optimum, "nine_pitch_angles", lambda *inputs: {"error_norm": 1.0})
     for payload in (20e3, 19e3):
         register_rocket("Again-v0", replace(TWO, payload=payload))
         metrics, _ = evaluate.evaluate("Again-v0", lambda obs, t: np.array([[-1.0, 0, 0]]), 0, 1)
@@ -243,8 +247,9 @@ def test_evaluation_does_not_keep_the_optimum_of_a_replaced_rocket(monkeypatch):
 
 
 def test_a_bad_file_of_vehicles_is_left_out_with_a_line(tmp_path):
-    for name in ("envs.py", "batched.py", "rocket_env.py", "rocket.py"):
-        shutil.copy(ROOT / name, tmp_path)
+    shutil.copy(ROOT / "envs.py", tmp_path)
+    for room in ("common", "phased", "rocket"):
+        shutil.copytree(ROOT / room, tmp_path / room)
     (tmp_path / "vehicles").mkdir()
     good = (ROOT / "vehicles" / "two_stage_leo.py").read_text()
     (tmp_path / "vehicles" / "a_bad_one.py").write_text(good.replace("payload=20e3", "payload=-20e3"))
@@ -329,10 +334,10 @@ def test_a_rocket_of_your_own_from_reference_to_figures(solved, env_id, tmp_path
     assert ("argp_error_deg" in metrics) == (rocket.e > 0)
     if rocket.e:
         assert metrics["argp_error_deg"] == pytest.approx(math.degrees(argp) - 20, abs=1e-6)
-    table = evaluate.table(metrics)
+    table = table_of(metrics)
     (row,) = (line for line in table.splitlines() if "argument of perigee" in line)
     assert (row.split()[-4:] == ["-"] * 4) == (rocket.e == 0) and table.startswith(env_id)
-    paths = figures.draw(tmp_path, arrays, metrics)
+    paths = evaluate.draw_figures(tmp_path, arrays, metrics, [])
     assert [path.name for path in paths] == ["trajectory.png", "orbit.png"] and all(path.exists() for path in paths)
 
 
@@ -342,7 +347,7 @@ def test_figures_of_a_rocket_of_your_own(solved, env_id):
     metrics, arrays, mission = solved[env_id]
     rocket = mission.rocket
     register_rocket(env_id, rocket, mission.cutoff, mission.ceiling_km)
-    figure = figures.draw_ascent(arrays, metrics)
+    figure = figure_of("trajectory.png", arrays, metrics)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     panel = next(ax for ax in figure.axes if "mass" in ax.get_ylabel())
@@ -353,7 +358,7 @@ def test_figures_of_a_rocket_of_your_own(solved, env_id):
     altitude = next(ax for ax in figure.axes if "altitude" in ax.get_ylabel())
     level = [line.get_ydata()[0] for line in altitude.lines if line.get_color() == "tab:green"]
     assert level == ([400.0] if env_id == "ThreeBurns-v0" else [])
-    plane, _, ground = figures.draw_orbit(arrays, metrics).axes
+    plane, _, ground = figure_of("orbit.png", arrays, metrics).axes
     target = next(line.get_xydata() for line in plane.lines if line.get_label() == "target orbit")
     lows, highs = np.array([plane.get_xlim(), plane.get_ylim()]).T
     assert (lows < target.min(axis=0)).all() and (highs > target.max(axis=0)).all()
@@ -366,7 +371,7 @@ def stub(env_id, rocket):
     register_rocket(env_id, rocket)
     flight = envs.fly_rocket(env_id, lambda obs, t: np.array([[1.0, 0.2, 0.0]]), action_frame="local")
     reference = flight | {"reference_mass_kg": 1.0, "reference_time_s": 1.0, "nine_pitch_error_norm": 1.0}
-    metrics = {"env_id": env_id} | evaluate.rocket_metrics(flight, reference, ROCKETS[env_id])
+    metrics = {"env_id": env_id} | rocket_metrics(flight, reference, ROCKETS[env_id])
     return metrics, {f"{key}{side}": flight[key] for key in "tuy" for side in ("", "_reference")}
 
 
@@ -375,7 +380,7 @@ def test_late_staging_labels_stay_inside():
     last = replace(SECOND, burn_time=20.0, propellant=5e3)
     rocket = replace(TWO, burns=(TWO.burns[0], Burn(182.0, ((1, last),))), end_time=182.0)
     metrics, arrays = stub("Late-v0", rocket)
-    figure = figures.draw_ascent(arrays, metrics)
+    figure = figure_of("trajectory.png", arrays, metrics)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     panel = next(ax for ax in figure.axes if "mass" in ax.get_ylabel())
@@ -388,7 +393,7 @@ def test_late_staging_labels_stay_inside():
 def test_orbit_figure_holds_the_whole_target_orbit(a, e):
     """Also where its perigee is far above the Earth."""
     metrics, arrays = stub("High-v0", replace(TWO, a=a, e=e))
-    plane = figures.draw_orbit(arrays, metrics).axes[0]
+    plane = figure_of("orbit.png", arrays, metrics).axes[0]
     (west, east), (south, north) = plane.get_xlim(), plane.get_ylim()
     b = a * math.sqrt(1 - e * e) / 1e6
     assert west < -a * (1 + e) / 1e6 and east > a * (1 - e) / 1e6 and south < -b and north > b
@@ -409,7 +414,7 @@ def test_evaluation_is_against_the_rocket_that_flies(monkeypatch, option):
         flight = envs.fly_rocket(CUTOFF, lambda obs, t: np.array([[1.0, 0.1, 0.0]]), end_time=100.0, rocket=flown)
         return {"final_mass_kg": 4321.0, "final_time_s": 100.0}, flight, None
 
-    monkeypatch.setattr(rocket_baselines, "solve_ascent", solve)
+    monkeypatch.setattr(optimum, "solve_ascent", solve)
     policy = lambda obs, t: np.array([[1.0, 0.3, 0.0]])  # noqa: E731
     metrics, arrays = evaluate.evaluate(CUTOFF, policy, 0, 1, action_frame="local", **option)
     assert solved == [flown] and metrics["reference_mass_kg"] == 4321.0
@@ -420,7 +425,7 @@ def test_evaluation_is_against_the_rocket_that_flies(monkeypatch, option):
     e = np.cross(s[3:6], h) / MU - s[:3] / np.linalg.norm(s[:3])
     error = [*(h - h_target) / np.linalg.norm(h_target), *(e - envs.target_orbit(flown.target)[1])]
     assert metrics["error_norm"] == pytest.approx(np.linalg.norm(error))
-    table = evaluate.table(metrics, envs.flown_mission(ROCKETS[CUTOFF], **option))
+    table = rocket_table(metrics, envs.flown_mission(ROCKETS[CUTOFF], **option))
     (row,) = (line for line in table.splitlines() if "semi-major" in line)
     assert float(row.split()[4]) == pytest.approx(flown.a / 1e3)
 
@@ -443,11 +448,11 @@ def test_equatorial_targets_are_measured_from_the_x_axis(i, sense, e):
     flight |= {"final_mass_kg": 5e3, "final_time_s": 1.0, "max_altitude_km": 1.0, "episodic_return": 0.0, "points": 0.0}
     flight |= dict.fromkeys(envs.RocketVectorEnv.PARTS, 0.0) | {"crashed": False, "y": state[None], "t": np.ones(1)}
     reference = flight | {"reference_mass_kg": 1.0, "reference_time_s": 1.0, "nine_pitch_error_norm": 1.0}
-    metrics = {"env_id": LEO, "eval_seed": 0} | evaluate.rocket_metrics(flight, reference, mission)
+    metrics = {"env_id": LEO, "eval_seed": 0} | rocket_metrics(flight, reference, mission)
     assert "raan_error_deg" not in metrics and ("argp_error_deg" in metrics) == (e > 0)
     assert metrics["i_error_deg"] == pytest.approx(0, abs=1e-9) and metrics["a_error_km"] == pytest.approx(0, abs=1e-6)
     assert metrics["argp_deg"] == pytest.approx(30)
-    table = evaluate.table(metrics, mission)
+    table = rocket_table(metrics, mission)
     (row,) = (line for line in table.splitlines() if "perigee from the x axis" in line)
     if e:
         assert metrics["argp_error_deg"] == pytest.approx(30 - 50)
@@ -465,11 +470,13 @@ def test_mass_for_an_equatorial_orbit_reached_is_of_its_perigee(monkeypatch):
         for i, sense in ((0.0, 1), (180.0, -1)):
             register_rocket("Equatorial-v0", replace(ROCKET, i=i), cutoff=True)
             asked = []
-            monkeypatch.setattr(baselines, "reached_optimum", lambda flight, rocket, a=asked: a.append(flight) or 1 / 0)
+            monkeypatch.setattr(
+                "rocket.task.reached_optimum", lambda flight, rocket, a=asked: a.append(flight) or 1 / 0
+            )
             metrics = {"env_id": "Equatorial-v0", "success": True, "raan_deg": 300.0}
             metrics["argp_deg"] = (100.0 + sense * 300.0) % 360
             with pytest.raises(ZeroDivisionError):
-                evaluate.mass_reached(metrics)
+                task_of("Equatorial-v0").reported_metrics(metrics)
             assert asked[0]["argp_deg"] == pytest.approx(100.0) and asked[0]["raan_deg"] == 300.0
 
 

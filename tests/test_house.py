@@ -1,0 +1,130 @@
+"""The house: imports run one way, each in the open, and what a command or training waits for stays light."""
+
+import ast
+import importlib.util
+import subprocess
+import sys
+from graphlib import TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+OUTSIDE = {"tests", "benchmarks", "docs"}  # they import the house; nothing in it imports them
+PATHS = [
+    path
+    for path in sorted(ROOT.rglob("*.py"))
+    if not OUTSIDE & set(path.relative_to(ROOT).parts) and not any(part.startswith(".") for part in path.parts)
+]
+ROOMS = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path for path in PATHS}
+# what may be imported inside a function: it takes long to load, or is optional
+SLOW = {"casadi", "scipy", "matplotlib", "tensorboard", "torch.utils.tensorboard", "wandb"}
+
+
+def imports(tree):
+    """Every import of a file: (the syntax node, the full names that it may import)."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield node, [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            yield node, [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+
+
+def rooms_of(tree):
+    """The rooms that a file imports, wherever it does."""
+    return {name for _, names in imports(tree) for name in names if name in ROOMS}
+
+
+def arrows():
+    """Of each room the rooms that it imports."""
+    return {room: rooms_of(ast.parse(path.read_text())) - {room} for room, path in ROOMS.items()}
+
+
+def test_imports_run_one_way():
+    """No circle, imports inside functions included: neither between files nor between folders."""
+    found = arrows()
+    assert len(found) > 40 and sum(map(len, found.values())) > 100
+    TopologicalSorter(found).prepare()  # CycleError names the circle
+    folders = {}
+    for room, others in found.items():
+        head = room.split(".")[0]
+        folders.setdefault(head, set()).update({other.split(".")[0] for other in others} - {head})
+    TopologicalSorter(folders).prepare()
+
+
+def test_a_circle_is_found():
+    with pytest.raises(ValueError, match="cycle"):
+        TopologicalSorter(arrows() | {"common.errors": {"evaluate"}}).prepare()
+
+
+def test_nothing_imports_a_script_or_what_stands_outside():
+    for path in PATHS:
+        for _, names in imports(ast.parse(path.read_text())):
+            assert not any(name.startswith("ppo_gtrxl") or name.split(".")[0] in OUTSIDE for name in names), path
+
+
+@pytest.mark.parametrize("path", PATHS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_imports_are_in_the_open(path):
+    """No star; inside a function only what is slow to load or optional, and rooms that load such a thing."""
+    tree = ast.parse(path.read_text())
+    top = {id(node) for node in tree.body}
+    for node, names in imports(tree):
+        assert not any(name.endswith(".*") for name in names), names
+        if id(node) not in top:
+            rooms = [name for name in names if name in ROOMS]
+            loads_slow = any(loads(room) & SLOW for room in rooms)
+            assert loads_slow or names[0] in SLOW or names[0].split(".")[0] in SLOW, names
+
+
+def loads(room, seen=None):
+    """The heads of all modules that importing a room loads at once, other rooms' included."""
+    seen = set() if seen is None else seen
+    seen.add(room)
+    found = set()
+    for node in ast.parse(ROOMS[room].read_text()).body:
+        for _, names in imports(node):
+            found |= {name.split(".")[0] for name in names}
+            for name in names:
+                if name in ROOMS and name not in seen:
+                    found |= loads(name, seen)
+    return found
+
+
+LIGHT = {room for room in ROOMS if room.split(".")[0] not in {"drawing", "runs", "sb3_env"}}
+LIGHT -= {room for room in ROOMS if room.startswith("ppo_gtrxl") or room.endswith((".figures", ".animation"))}
+
+
+def test_rooms_load_nothing_heavy():
+    """A training and `--help` wait for no solver and no drawing; the environments need no torch."""
+    heavy = ["torch", "casadi", "scipy", "matplotlib", "PIL"]
+    names = sorted(LIGHT)
+    assert {"envs", "baselines", "evaluate", "rocket.guidance", "phased.task"} <= set(names)
+    code = f"import importlib, sys; [importlib.import_module(name) for name in {names}]\n"
+    code += f"print(*{{*{heavy}}} & sys.modules.keys())"
+    result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == ""
+
+
+def test_every_room_can_be_entered_first():
+    """A room that only loads after another one has a hidden arrow."""
+    names = sorted(room for room in LIGHT if not room.startswith("vehicles."))
+    for name in names:
+        assert importlib.util.find_spec(name)
+    code = "import subprocess, sys; from multiprocessing.pool import ThreadPool\n"
+    code += "run = lambda n: subprocess.run([sys.executable, '-c', f'import {n}'], capture_output=True).returncode\n"
+    code += f"print(*[n for n, bad in zip({names}, ThreadPool(2).map(run, {names})) if bad])"
+    result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == ""
+
+
+# --- a family is an object --------------------------------------------------------------------------------------------
+
+
+def test_nothing_asks_which_family_an_id_is_of():
+    """The tables by id are read by their own family, by what registers it, and by the scripts' Problem section."""
+    families = {"PROBLEMS": ("phased", "envs", "baselines", "ppo_gtrxl"), "ROCKETS": ("rocket", "envs", "ppo_gtrxl")}
+    for path in [*PATHS, *(ROOT / "benchmarks").glob("*.py")]:
+        head = path.relative_to(ROOT).parts[0].removesuffix(".py")
+        names = {node.id for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Name)}
+        for table, readers in families.items():
+            assert table not in names or head.startswith(readers), (path, table)
