@@ -30,9 +30,10 @@ def flight_metrics(flight: dict, reference: dict) -> dict:
 def hits_every_circle(problem: Problem, x: np.ndarray) -> np.ndarray:
     """Whether flights x (n, T+1, 2) are within the target's radius at the end of every phase; (n,) bool."""
     phases = problem.phases
-    d = x[:, problem.phase_ends] - [phase.target for phase in phases]  # (n, phases, 2)
+    d: np.ndarray = x[:, problem.phase_ends] - [phase.target for phase in phases]  # (n, phases, 2)
     # hypot, as in the environment: the optimum is on the circle's edge, where another rounding would decide otherwise
-    return (np.hypot(d[..., 0], d[..., 1]) <= [phase.radius for phase in phases]).all(axis=1)
+    distance: np.ndarray = np.hypot(d[..., 0], d[..., 1])
+    return np.all(distance <= [phase.radius for phase in phases], axis=1)
 
 
 def comparable(problem: Problem, x: np.ndarray, x_reference: np.ndarray) -> np.ndarray:

@@ -388,8 +388,9 @@ def drawn_ascent(rocket: Rocket, dispersion: float, z, orbit) -> RemainingAscent
     thrust, flow, dropped = (column[: len(end), 0] for column in (vehicle.thrust, vehicle.flow, vehicle.dropped))
     lost = flow * np.diff(end, prepend=0.0) + dropped
     mass = vehicle.mass[0] - np.append(0.0, np.cumsum(lost)[:-1])
-    air = (vehicle.drag[0], *vehicle.wind[:, 0])
-    return RemainingAscent(0.0, rocket.x0[:6], end, thrust, flow, mass, *orbit, air)
+    air = (vehicle.drag[0], vehicle.wind[0, 0], vehicle.wind[1, 0])
+    h, e = orbit
+    return RemainingAscent(0.0, rocket.x0[:6], end, thrust, flow, mass, h, e, air)
 
 
 def solve_drawn(job):

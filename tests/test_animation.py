@@ -21,6 +21,8 @@ from drawing.animation import Flight
 from phased.animation import PhasePlane
 from rocket.animation import AscentSheet
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[1]
 IDS = [*envs.PROBLEMS, *envs.ROCKETS]
 SHAPE = (450, 800, 3)

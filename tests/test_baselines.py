@@ -218,6 +218,7 @@ WAYPOINTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env_id", WAYPOINTS)
 def test_waypoint_numbers(env_id):
     (cost_free, cost), distance_free, distance, extra = WAYPOINTS[env_id]
@@ -266,6 +267,7 @@ def test_optimum_ends_on_the_edge_of_its_last_circle(env_id):
     np.testing.assert_allclose(optimum["terminal_error"][:, -1], radius, rtol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env_id, phase", [
     ("DoubleIntegratorWaypoints-v0", 0),
     ("DoubleIntegratorWaypoints-v0", -1),
@@ -302,6 +304,7 @@ def hard_start():
     return (np.random.default_rng(1).uniform(-1, 1, (20, 2)) * (np.pi, 1))[10:11]
 
 
+@pytest.mark.slow
 def test_best_of_several_guesses_swings_a_pendulum_up(new_problem, hard_start):
     """From one guess the pendulum ends elsewhere, at several times the cost; both are what the environment flies."""
     one = reference(new_problem(swing_up("OneGuess-v0", 15, single_optimum=True)), hard_start)
@@ -352,6 +355,7 @@ def test_guesses_are_of_the_start_alone(new_problem):
             np.testing.assert_array_equal(value[0], together[key][n])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("in_circles", [False, True])
 @pytest.mark.parametrize("built_in", ["DoubleIntegrator-v0", "VanDerPol-v0", *WAYPOINTS])
 def test_single_optimum_is_a_promise_that_is_kept(new_problem, built_in, in_circles):
@@ -482,6 +486,7 @@ def run(folder, *arguments):
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=60)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name, env_id, key", [
     ("double-integrator", "DoubleIntegrator-v0", "K0_1"),
     ("van-der-pol", "VanDerPol-v0", "collocation_ratio_of_sums"),

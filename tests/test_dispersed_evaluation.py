@@ -155,6 +155,7 @@ def test_only_closed_orbits_have_elements():
     assert metrics["dispersed_error_p99"] == pytest.approx(1.0 + 0.97 * 0.5)  # of 0.001, 0.002, 1, 1.5
 
 
+@pytest.mark.slow
 def test_table_and_figure(flown, tmp_path):
     metrics, arrays = flown
     table = table_of(metrics)
@@ -194,6 +195,7 @@ def test_a_dispersion_that_cannot_be_is_refused(value):
         parse(f"--dispersion={value}")
 
 
+@pytest.mark.slow
 def test_a_file_older_than_the_flags_is_flown_and_an_oracle_needs_its_draw(tmp_path, monkeypatch):
     """The shipped nominal policies know none of them; what sees a draw cannot be flown as if it did not."""
     monkeypatch.chdir(tmp_path)

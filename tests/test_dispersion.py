@@ -343,6 +343,7 @@ def test_the_flight_computer_never_shows_less_than_the_nominal_dry_mass():
 # --- dispersion 0 and 1 -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env_id", IDS)
 def test_without_dispersion_nothing_changes(env_id):
     plain = gym.make_vec(env_id, num_envs=3, action_frame="local")
@@ -467,6 +468,7 @@ def test_autoreset_draws_anew_only_for_those_that_ended():
     assert obs[1, 6] == 301454
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env_id", [CUTOFF, LEO])
 def test_given_draws_reproduce_a_flight_alone_and_in_a_batch(env_id):
     batch = make(env_id, 4, observe_draw=True)
@@ -640,6 +642,7 @@ def test_bad_options_are_refused():
     assert batch.vehicles.dry_mass[0] == pytest.approx(4 + 2480)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dispersion", [5, 100])
 def test_wild_dispersions_crash_but_do_not_raise(dispersion):
     with warnings.catch_warnings():

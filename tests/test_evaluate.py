@@ -464,6 +464,7 @@ def test_cost_figure_shows_the_parts_and_marks_misses():
     assert labels == [*expected[:2], "miss", *expected[3:]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env_id", [SINGLE, "VanDerPol-v0"])
 def test_cost_error_figure_shows_every_start(env_id, tmp_path):
     metrics, arrays = evaluate.evaluate(env_id, feedback(env_id, 20.0, 2.0), 5, 20, reference_flight(env_id, 5, 20))
@@ -500,6 +501,7 @@ def test_median_curve_ends_with_the_shortest_seed():
 # ---------------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_publish_ships_the_first_seed_and_adds_the_second(tmp_path, monkeypatch, capsys):
     first, second = make_run(tmp_path / "a", seed=1), make_run(tmp_path / "b", seed=2, level=-1.0)
     results = tmp_path / "results" / "di"
@@ -566,6 +568,7 @@ def test_a_curve_that_is_none_is_named(tmp_path, text):
         read_csv(tmp_path / "1.csv")
 
 
+@pytest.mark.slow
 def test_shipping_another_seed_replaces_all_or_nothing(tmp_path, monkeypatch, capsys):
     first, second = make_run(tmp_path / "a", seed=1), make_run(tmp_path / "b", seed=2)
     results = tmp_path / "results" / "di"
@@ -614,6 +617,7 @@ def test_a_seed_is_listed_once_the_rest_is_there(tmp_path, monkeypatch, capsys):
     assert {path.name for path in written if results in path.parents} == {"1.csv", "1.json", *SHIPPED}
 
 
+@pytest.mark.slow
 def test_figures_of_a_run_folder(tmp_path, monkeypatch, capsys):
     run = make_run(tmp_path / "run", env_id=WAYPOINTS)
     printed = command_line(monkeypatch, capsys, "figures", run)

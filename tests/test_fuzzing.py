@@ -9,9 +9,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 import torch
 
 import runs
+
+pytestmark = pytest.mark.slow
 
 
 def test_thousand_command_lines(robustness):

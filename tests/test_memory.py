@@ -72,6 +72,7 @@ def test_gates_are_the_networks():
     np.testing.assert_allclose(found[1, 0], [1 / (1 + np.exp(1.0)), 0.0], atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name, heads", [("vdp_waypoints", 6), ("rocket_cutoff", 8)])
 def test_attention_of_a_shipped_policy(name, heads, tmp_path, monkeypatch, capsys):
     path = tmp_path / "attention.png"
@@ -95,15 +96,6 @@ def test_the_flight_begins_with_the_evaluations_first_start(new_problem):
     _, flight = evaluate.evaluate(env_id, lambda obs, t: np.zeros((len(obs), 1)), 3, 10)
     np.testing.assert_allclose(obs[:, :2], flight["x"][0, :-1])
     assert len(t) == len(obs) == 50 and np.abs(obs[0, :2]).max() < 2.5
-
-
-def test_a_figure_of_attention_is_whole_or_as_it_was(tmp_path, monkeypatch, capsys, cut_figures):
-    path = tmp_path / "attention.png"
-    path.write_bytes(b"the old one")
-    monkeypatch.setattr(sys, "argv", ["attention.py", str(ROOT / "results" / "vdp_waypoints"), str(path)])
-    with pytest.raises(SystemExit, match="error: .*No space left"):
-        attention.main()
-    assert path.read_bytes() == b"the old one" and len(list(tmp_path.iterdir())) == 1
 
 
 def evaluations(folder, values):
@@ -132,34 +124,6 @@ def test_a_cell_says_of_how_many_seeds_it_is():
     runs = [{"hit_rate": 1.0, "ratio_of_sums": 1.05}, {"hit_rate": 0.0}, {"hit_rate": 0.0}]
     assert memory.cell_of(runs, "ratio_of_sums") == "1.05, 1 of 3"
     assert memory.cell_of(runs, "hit_rate") == "0 (0 to 1)" and memory.cell_of(runs[1:], "ratio_of_sums") == "-"
-
-
-def test_a_line_for_each_run(tmp_path, monkeypatch, capsys):
-    """Those of L_mem 32 lie in a results folder of their own, beside results/memory."""
-    folder, seeds = tmp_path / "memory", tmp_path / "rocket_cutoff" / "seeds"
-    (folder / "nominal").mkdir(parents=True)
-    seeds.mkdir(parents=True)
-    for seed, error in {1: 0.25, 2: 0.5}.items():
-        metrics = {"env_id": "RocketAscentCutoff-v0", "seed": seed, "error_norm": error, "final_mass_kg": 7500.0}
-        (seeds / f"{seed}.json").write_text(json.dumps(metrics))
-    monkeypatch.setattr(sys, "argv", ["memory.py", str(folder), "--by-seed"])
-    memory.main()
-    title, header, first, second = (re.split("  +", line.strip()) for line in capsys.readouterr().out.splitlines())
-    assert "nominal flight" in title[0] and header == ["seed", "||error||", "perigee (km)", "mass (kg)"]
-    assert first == ["L_mem 32", "1", "0.25", "-", "7500"] and second == ["L_mem 32", "2", "0.5", "-", "7500"]
-    monkeypatch.setattr(sys, "argv", ["memory.py", str(folder)])
-    memory.main()
-    assert "0.375 (0.25 to 0.5)" in capsys.readouterr().out
-    assert not list(tmp_path.rglob("*.png"))  # these rows are a means, not a finding
-
-
-def test_the_figure_is_whole_or_as_it_was(tmp_path, monkeypatch, capsys, cut_figures):
-    evaluations(tmp_path / "hidden_velocity" / "memory_4", [1.5])
-    (tmp_path / "memory.png").write_bytes(b"the old one")
-    monkeypatch.setattr(sys, "argv", ["memory.py", str(tmp_path)])
-    with pytest.raises(SystemExit, match="error: .*No space left"):
-        memory.main()
-    assert (tmp_path / "memory.png").read_bytes() == b"the old one" and not list(tmp_path.glob(".*"))
 
 
 def test_what_no_memory_can_beat_is_the_best_of_first_actions_that_see_the_position_alone():
@@ -196,12 +160,6 @@ def test_the_heaviest_weight_is_on_an_earlier_step_of_the_flight():
     found = np.array([[0.1, 0.0, 0.9], [0.2, 0.5, 0.3], [0.6, 0.1, 0.3]])  # the first step: 0.9 on what lies before it
     assert attention.heaviest(found, dt=0.5) == ", at most 0.50 on another (at 0.5 s on that of 0.0 s)"
     assert attention.heaviest(np.ones((3, 1)), dt=0.5) == ""
-
-
-def test_an_empty_folder_is_one_line(tmp_path, monkeypatch):
-    monkeypatch.setattr(sys, "argv", ["memory.py", str(tmp_path)])
-    with pytest.raises(SystemExit, match="error: .* has no finished run"):
-        memory.main()
 
 
 def di_jobs(experiment):

@@ -18,6 +18,8 @@ from rocket.dispersion import DRAW
 from rocket.metrics import dispersed_metrics, draws, evaluate_dispersed, fly_dispersed
 from rocket.optimum import rocket_reference
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[1]
 SHIPPED = ROOT / "results" / "rocket_cutoff"
 SCORES = len(DRAW)

@@ -87,53 +87,6 @@ def test_a_row_waits_for_the_one_that_it_begins_with(folder, commands, monkeypat
         assert started.index(first) < started.index(second)
 
 
-def test_rows_trains_these_alone(folder, commands, monkeypatch):
-    """A row that begins with another needs that one's policy, which may be of an earlier call."""
-    started, _ = commands
-    two_rows(monkeypatch)
-    for name in ("first", "second"):
-        monkeypatch.setattr(sys, "argv", ["peers.py", "--rows", name])
-        peers.main()
-        assert {line.split()[1] for line in started} == {f"runs/peer_{name}_{seed}.zip" for seed in (1, 2)}
-        started.clear()
-
-
-def test_rows_may_be_named_in_any_order(folder, commands, monkeypatch):
-    started, _ = commands
-    two_rows(monkeypatch)
-    assert peers.train_all(1, ["second", "first", "second"]) == [] and len(started) == 2 * 4
-
-
-def test_failed_runs_are_named_and_exit_with_1(folder, commands, monkeypatch, capsys):
-    """Also those that had nothing to begin with; the others are trained."""
-    started, failing = commands
-    two_rows(monkeypatch)
-    failing.append("runs/peer_first_2.zip")
-    monkeypatch.setattr(sys, "argv", ["peers.py"])
-    with pytest.raises(SystemExit) as stop:
-        peers.main()
-    failed, missing = str(stop.value.code).splitlines()
-    assert failed == "error: first, seed 2: ended with 1, see runs/peer_first_2.log"
-    assert missing.startswith("error: second, seed 2: runs/peer_first_2.zip is missing, with which it begins; ")
-    assert len(started) == 2 * 3 and (folder / "figures" / "second_1.json").exists()
-
-
-def test_a_policy_that_is_gone_is_named(folder, commands, monkeypatch):
-    """Its figures are in results/, which git has, the policy in runs/, which git has not."""
-    started, _ = commands
-    two_rows(monkeypatch)
-    trained(folder / "figures", "first", 1)
-    assert "delete figures/first_1.json, if it is there" in peers.train("second", 1) and not started
-
-
-@pytest.mark.parametrize("content", ['{"curve": [{"samp', "[]", '{"final": {}}'])
-def test_a_damaged_file_is_one_line(folder, monkeypatch, content):
-    (folder / "figures" / "di_1.json").write_text(content)
-    monkeypatch.setattr(sys, "argv", ["peers.py", "--table"])
-    with pytest.raises(SystemExit, match=r"^error: figures/di_1.json is not what sb3_ppo.py writes .*again$"):
-        peers.main()
-
-
 def test_every_command_is_one_that_the_script_takes(monkeypatch):
     pytest.importorskip("sb3_contrib")
     import sb3_ppo

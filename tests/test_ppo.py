@@ -262,6 +262,7 @@ def test_only_learned_noise_is_learned(learner, noise):
 # --- refinement -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("refine_from, begins", [(0.0, [1]), (0.5, [6]), (0.51, [7]), (1.0, [11]), (None, [])])
 def test_refinement_begins_once(learner, monkeypatch, refine_from, begins):
     """Of 11 updates; from then on the noise is no longer learned, and the environments know."""

@@ -21,6 +21,8 @@ from envs import ascent as dynamics
 from rocket import optimum, report
 from rocket.optimum import ASCENTS, STORED, nine_pitch_angles, rocket_reference
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).resolve().parents[1]
 KEYS = {"final_mass_kg", "final_time_s", "error_norm", "replay_error_norm", "solve_seconds", "status"}
 FREE = ("free", "free_table_isp", "drag_free", "TwoStageLEO-v0")

@@ -290,6 +290,7 @@ def hostile(v, obs, t):
     ])  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env_id, table_isp", [(FIXED, False), (CUTOFF, True), (LEO_FIXED, True), (LEO, False)])
 def test_every_observation_lies_in_the_space(env_id, table_isp):
     v = VEHICLES[env_id]
@@ -384,6 +385,7 @@ def mixed(v, t, n, episode):
     return np.array([v.programme(2 * t), early_dive, [1.0, 0.01, 0.0], late_dive][n])
 
 
+@pytest.mark.slow
 @both
 def test_single_environment_is_the_vector_environment(v):
     """Over the first episodes' ends into the next ones; the singles' next episode is flown by new environments."""
@@ -432,6 +434,7 @@ def test_single_environment_is_the_vector_environment(v):
     assert len({end[0][0] for end in ends}) == 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "env_id, steering, last",
     [
@@ -645,6 +648,7 @@ def test_other_bad_input_is_refused():
 # --- the gymnasium interface ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env_id", REGISTERED)
 @pytest.mark.parametrize("action_frame", ["eci", "local"])
 @pytest.mark.parametrize("table_isp", [False, True])

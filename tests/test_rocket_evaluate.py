@@ -568,6 +568,7 @@ def make_run(folder, flight, seed=1, level=0.0, **changes):
     return folder
 
 
+@pytest.mark.slow
 def test_publish_and_figures(flown, tmp_path, monkeypatch, capsys):
     first = make_run(tmp_path / "a", flown[CUTOFF])
     second = make_run(tmp_path / "b", flown[CUTOFF], seed=2, error_norm=0.5, final_mass_kg=6000.0, mass_ratio=0.8)

@@ -67,6 +67,7 @@ KNOTS_OF_TWO_STAGES = ([0, 10.77127660, 43.08510638, 81, 162], [90, 88, 72, 55, 
 ALL_WEIGHTS = {"guidance": "knots", "mass_weight": 0.3, "trajectory_weight": 0.7, "guidance_weight": 0.2}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "env_id, steering, weights, knots",
     [

@@ -1,7 +1,6 @@
 """`benchmarks/run_seeds.py`: skips what is finished, goes on with what was cut, publishes, reports what failed."""
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -14,6 +13,8 @@ import run_seeds
 
 import evaluate
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parent.parent
 TINY = "--embed-dim 8 --num-heads 2 --num-blocks 1 --memory-length 4 --mlp-dim 8 --hidden-dim 8 --num-envs 2"
 TINY += " --num-minibatches 2 --update-epochs 2 --eval-starts 10 --num-threads 1"
@@ -25,96 +26,33 @@ def start(folder, lines):
     return subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
-def read_logs(folder):
-    return [path.read_text() for path in folder.glob("runs/results_tiny_seed_*.log")]
-
-
-def interrupted(folder, signum):
-    """The lines of two jobs that got the signal once both trained."""
-    lines = [f"results/tiny ppo_gtrxl_di.py --seed {seed} --total-updates 150 {TINY}  # seed {seed}" for seed in (1, 2)]
-    process = start(folder, ["# two seeds", "", *lines])
-    while process.poll() is None and sum("update 1/150" in log for log in read_logs(folder)) < 2:
+@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
+def test_run_seeds_survives_a_restart(tmp_path, monkeypatch, capsys, signum):
+    """A seed is stopped and saved; the second start goes on with it, the third has nothing to do."""
+    lines = ["# one seed", "", f"results/tiny ppo_gtrxl_di.py --seed 1 --total-updates 60 {TINY}  # seed 1"]
+    process, log = start(tmp_path, lines), tmp_path / "runs" / "results_tiny_seed_1.log"
+    while process.poll() is None and not (log.exists() and "update 1/60" in log.read_text()):
         time.sleep(0.02)
     process.send_signal(signum)
     process.communicate(timeout=60)
-    assert process.returncode == 128 + signum and not list(folder.glob("runs/*/eval.json"))
-    logs = read_logs(folder)
-    assert len(logs) == 2 and all("stopped after update" in log for log in logs), "what it started, it ended"
-    return lines
-
-
-def test_sigterm_ends_what_was_started(tmp_path):
-    interrupted(tmp_path, signal.SIGTERM)
-
-
-def test_run_seeds_survives_a_restart(tmp_path):
-    """Two seeds, stopped by Ctrl-C; the second start goes on with both, the third has nothing to do."""
-    lines = interrupted(tmp_path, signal.SIGINT)
+    assert process.returncode == 128 + signum and not list(tmp_path.glob("runs/*/eval.json"))
+    assert "stopped after update" in log.read_text(), "what it started, it ended"
+    if signum == signal.SIGTERM:
+        return
     second = start(tmp_path, lines)
     output, errors = second.communicate(timeout=120)
     assert second.returncode == 0, errors
-    assert "2 jobs, 0 trained already" in output and output.count("ended with 0") == 2
-    assert len(list(tmp_path.glob("runs/*/"))) == 2  # resumed, not begun anew
-    assert {path.name for path in tmp_path.glob("results/tiny/*")} == {
-        "seeds"
-    }  # --numbers: neither weights nor figures
-    seeds = {path.stem: json.loads(path.read_text()) for path in (tmp_path / "results/tiny/seeds").glob("*.json")}
-    assert {name: metrics["total_updates"] for name, metrics in seeds.items()} == {"1": 150, "2": 150}
+    assert "1 jobs, 0 trained already" in output and output.count("ended with 0") == 1
+    (folder,) = tmp_path.glob("runs/*/")  # resumed, not begun anew
+    # --numbers: neither weights nor figures
+    assert [path.name for path in tmp_path.glob("results/tiny/*")] == ["seeds"]
+    assert json.loads((tmp_path / "results/tiny/seeds/1.json").read_text())["total_updates"] == 60
     before = {path: path.stat().st_mtime_ns for path in tmp_path.glob("results/**/*")}
-    third = start(tmp_path, lines)
-    output, _ = third.communicate(timeout=60)
-    assert third.returncode == 0 and output == "2 jobs, 2 trained already\n"
+    monkeypatch.chdir(tmp_path)
+    capsys.readouterr()
+    assert run_seeds.work(run_seeds.read_jobs("jobs.txt"), 2, numbers=True) == []
+    assert capsys.readouterr().out == "1 jobs, 1 trained already\n"
     assert {path: path.stat().st_mtime_ns for path in tmp_path.glob("results/**/*")} == before
-
-
-def test_a_job_with_a_bad_flag_stops_before_any_training(tmp_path):
-    process = start(tmp_path, [f"results/tiny ppo_gtrxl_di.py {TINY}", "results/tiny ppo_gtrxl_di.py --gamma 7"])
-    _, errors = process.communicate(timeout=60)
-    assert process.returncode == 1 and "--gamma 7.0: must be between 0.0 and 1.0" in errors
-    assert not (tmp_path / "runs").exists()
-
-
-@pytest.mark.parametrize(
-    "line, says",
-    [
-        (
-            "results/x evaluate.py --foo",
-            "'results/x evaluate.py --foo' must be a results folder, one of ppo_gtrxl_di.py, ",
-        ),
-        ("results/x benchmarks/memory.py", "'results/x benchmarks/memory.py' must be a results folder, "),
-        ("results/x", "'results/x' must be a results folder, "),
-        ("results/x ppo_gtrxl_di.py --exp-name 'open", "No closing quotation"),
-        ("results/x ppo_gtrxl_di.py --gamma 7", "--gamma 7.0: must be between 0.0 and 1.0"),
-        ("results/x ppo_gtrxl_di.py --foo", "Unrecognized"),
-        ("results/x ppo_gtrxl_di.py --checkpoint nothing", "--checkpoint nothing: No such file or directory"),
-        ("results/x ppo_gtrxl_di.py --help", "--help trains nothing"),
-        ("results/x ppo_gtrxl_di.py --no-save-model", "--no-save-model leaves no run to publish"),
-    ],
-)
-def test_the_line_that_cannot_be_a_job_is_named(tmp_path, monkeypatch, line, says):
-    (tmp_path / "jobs.txt").write_text(f"# a comment\nresults/x ppo_gtrxl_di.py\n{line}\n")
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["run_seeds.py", "jobs.txt"])
-    with pytest.raises(SystemExit) as stop:
-        run_seeds.main()
-    message = str(stop.value.code)
-    assert message.startswith(f"error: jobs.txt, line 3: {says}")
-    assert "\n" not in message and list(tmp_path.iterdir()) == [tmp_path / "jobs.txt"]
-
-
-@pytest.mark.parametrize("content", ['{"seed": 1', "[]", "\xff"])
-def test_a_damaged_run_of_others_is_skipped_and_named_once(tmp_path, monkeypatch, capsys, content):
-    """Newer than the run that is looked for, which is found all the same."""
-    monkeypatch.chdir(tmp_path)
-    for number, (name, text) in enumerate({"mine": json.dumps({"seed": 1}), "other": content}.items()):
-        path = tmp_path / "runs" / name / "args.json"
-        path.parent.mkdir(parents=True)
-        path.write_text(text, encoding="latin-1")
-        os.utime(path, (number, number))
-    job = run_seeds.Job(tmp_path / "results", [], {"seed": 1})
-    assert job.run_dir() == job.run_dir() == Path("runs/mine")
-    printed = capsys.readouterr().out
-    assert printed.startswith("runs/other/args.json is skipped") and printed.count("\n") == 1
 
 
 def test_a_run_is_trained_once_its_evaluation_is_whole(tmp_path, monkeypatch):
@@ -206,12 +144,6 @@ def test_two_jobs_never_go_on_with_one_run():
     again = SimpleNamespace(run_dir=lambda: "runs/a")
     assert run_seeds.next_free([again, there], [here]) is there and run_seeds.next_free([again], [there]) is again
     assert run_seeds.next_free([again], [here, there]) is None and run_seeds.next_free([new], [here, new]) is new
-
-
-def test_without_a_run_nothing_is_published(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(ValueError, match="runs/ holds no run with these arguments"):
-        run_seeds.Job(tmp_path / "results", [], {"seed": 1}).publish(False)
 
 
 @pytest.mark.parametrize("seed, replaces", [(1, True), (2, False)])

@@ -263,21 +263,3 @@ def test_the_benchmarks_dispersed_run(tmp_path, monkeypatch):
     assert evaluated == [(1000, 0.0)] * 2 + [(1705, 1.0)] * 4  # twice in each run
     saved = pickle.loads((tmp_path / "dispersed.pkl").read_bytes())
     assert vars(saved)["mean_flight"][:100].any(dim=1).all()
-
-
-@pytest.mark.parametrize(
-    "flags, line",
-    [
-        ("--log-std 3", "--log-std 3.0: must be between -8.0 and 0.5"),
-        ("--mass-weight 0.5", "--mass-weight 0.5: only a rocket has it, not DoubleIntegrator-v0"),
-        ("--start nothing.zip", "--start nothing.zip: there is no nothing.zip"),
-    ],
-)
-def test_the_benchmark_refuses_in_one_line(flags, line, monkeypatch, capsys):
-    pytest.importorskip("sb3_contrib")
-    import sb3_ppo
-
-    monkeypatch.setattr("sys.argv", ["sb3_ppo.py", *flags.split()])
-    with pytest.raises(SystemExit) as stop:
-        sb3_ppo.parse_args()
-    assert stop.value.code == f"error: {line}" and capsys.readouterr().err == ""

@@ -132,20 +132,11 @@ TABLE_1 = {
     "ent_coef_final": (1e-4, 1e-4),
     "clip_coef": (0.2, 0.2),
 }
-# INTERFACE and DECISIONS: what the paper does not give
-OURS = {"num_envs": (80, 117), "radius_curriculum": (12, 6), "memory_noise": (0.1, 0.1)}
-OURS |= {"reward_scale": (0.1, 0.1), "max_grad_norm": (0.5, 0.5), "env_id": ("DoubleIntegrator-v0", "VanDerPol-v0")}
-OURS |= {
-    "save_model": (True, True),
-    "observe_phase": (True, True),
-    "observe_velocity": (True, True),
-    "norm_adv": (True, True),
-}
 
 
-@pytest.mark.parametrize("name", TABLE_1 | OURS)
+@pytest.mark.parametrize("name", TABLE_1)
 def test_defaults_are_the_papers(name):
-    assert tuple(getattr(script.Args(), name) for script in (DI, VDP)) == (TABLE_1 | OURS)[name]
+    assert tuple(getattr(script.Args(), name) for script in (DI, VDP)) == TABLE_1[name]
 
 
 def test_flags_of_the_interface():
@@ -181,7 +172,12 @@ ROCKET_KEYS = """error_norm a_km e i_deg raan_deg argp_deg perigee_km apogee_km 
     max_altitude_km success"""
 
 
-@pytest.fixture(scope="module", params=CASES, ids=lambda case: case[1])
+# each script and each kind of table once, and whatever a reader has added
+ALIKE = {"DoubleIntegratorWaypoints-v0", "VanDerPol-v0", "TwoStageLEO-v0"}
+SMOKED = [(script, env_id) for script, env_id in CASES if env_id not in ALIKE]
+
+
+@pytest.fixture(scope="module", params=SMOKED, ids=lambda case: case[1])
 def smoke(request, tmp_path_factory):
     """`--total-updates 2 --num-envs 4` in a subprocess from another directory: its folder, id, output, CPU time."""
     script, env_id = request.param
@@ -196,6 +192,7 @@ def smoke(request, tmp_path_factory):
     return script, folder, env_id, done.stdout, seconds
 
 
+@pytest.mark.slow
 def test_smoke_run_is_short(smoke):
     """15 s on a free core; CPU time is counted, with room for a core that is shared."""
     *_, env_id, _, seconds = smoke
@@ -206,15 +203,13 @@ def test_smoke_run_is_short(smoke):
 
 
 def steps_flown(run, env_id):
-    """Environment steps after each of the two updates of 4 episodes; the two-stage rocket may fall back to the pad."""
+    """Environment steps after each of the two updates of 4 episodes."""
     lengths = np.array([value for _, value in scalars(run)["charts/episodic_length"]])
-    if env_id == "TwoStageLEO-v0":
-        assert len(lengths) == 2 and (0 < lengths).all() and (lengths <= STEPS[env_id]).all()
-    else:
-        assert lengths.tolist() == [STEPS[env_id]] * 2
+    assert lengths.tolist() == [STEPS[env_id]] * 2
     return np.cumsum(4 * lengths).round().astype(int).tolist()
 
 
+@pytest.mark.slow
 def test_smoke_run_writes_what_the_interface_names(smoke):
     script, folder, env_id, output, _ = smoke
     (run,) = (folder / "runs").iterdir()
@@ -235,6 +230,7 @@ def test_smoke_run_writes_what_the_interface_names(smoke):
     assert "optimum" in output and "ours" in output and ("difference" if rocket else "ratio") in output
 
 
+@pytest.mark.slow
 def test_smoke_run_logs_the_tags(smoke):
     script, folder, env_id, *_ = smoke
     (run,) = (folder / "runs").iterdir()
@@ -294,6 +290,7 @@ def test_flags_of_the_machine(tmp_path, monkeypatch):
     assert (names["project"], names["name"]) == ("mine", run_folder().name)
 
 
+@pytest.mark.slow
 def test_smoke_run_saves_the_averaged_weights(smoke):
     _, folder, env_id, *_ = smoke
     (run,) = (folder / "runs").iterdir()
@@ -311,6 +308,7 @@ def test_smoke_run_saves_the_averaged_weights(smoke):
     assert not torch.equal(weights["actor.0.weight"], state["agent"]["actor.0.weight"])
 
 
+@pytest.mark.slow
 def test_eval_only_repeats_the_runs_evaluation(smoke, tmp_path, monkeypatch, capsys):
     """Same checkpoint and starts: the same numbers to the last bit, and only the named files."""
     script, folder, env_id, output, _ = smoke
@@ -344,6 +342,7 @@ def trained(tmp_path_factory):
     return run
 
 
+@pytest.mark.slow
 def test_capture_video_draws_the_figures_and_the_animation(trained):
     names = {"training.png", "trajectories.png", "costs.png", "cost_error.png", "animation.gif"}
     assert {path.name for path in (trained / "figures").iterdir()} == names
@@ -361,6 +360,7 @@ def test_hyperparameters_are_logged_as_text(trained):
     assert text.decode().splitlines() == ["|param|value|", "|-|-|", *(f"|{k}|{v}|" for k, v in args.items())]
 
 
+@pytest.mark.slow
 def test_run_folder_is_printed_at_the_start_and_the_end(smoke):
     _, folder, _, output, _ = smoke
     (run,) = (folder / "runs").iterdir()
@@ -369,6 +369,7 @@ def test_run_folder_is_printed_at_the_start_and_the_end(smoke):
     assert lines[0] == lines[-1] == line and output.count(line) == 2
 
 
+@pytest.mark.slow
 def test_two_runs_within_a_second(tmp_path, monkeypatch):
     """Another run of this script has begun in this second, and in the two to come: this one waits for its own."""
     monkeypatch.chdir(tmp_path)
@@ -510,13 +511,14 @@ def test_docs_give_the_papers_rocket():
     assert any(words[k : k + len(command)] == command for k in range(len(words)))
 
 
+@pytest.mark.slow
 def test_the_papers_rocket_network_trains(tmp_path):
     """One update of exactly that network, with two episodes and one epoch; its memory is printed."""
     more = ["--total-updates", "1", "--num-envs", "2", "--update-epochs", "1", "--eval-every", "0"]
     command = [sys.executable, ROCKET.__file__, *TABLE_1_ROCKET.split(), *more]
     peak = "import resource, runpy, sys; sys.argv = sys.argv[1:]; runpy.run_path(sys.argv[0], run_name='__main__');"
     peak += "print('peak MB', resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024)"
-    environment = {**os.environ, "OMP_NUM_THREADS": "2", "PYTHONPATH": str(ROOT)}
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     command[1:1] = ["-c", peak]
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
@@ -540,9 +542,12 @@ def rocket_run(folder, *argv):
 
 @pytest.fixture(scope="module")
 def rocket(tmp_path_factory):
-    return rocket_run(tmp_path_factory.mktemp("rocket"), "--action-frame=eci", "--capture-video")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(animation, "FRAMES", 3)  # the others are drawn alike
+        return rocket_run(tmp_path_factory.mktemp("rocket"), "--action-frame=eci", "--capture-video")
 
 
+@pytest.mark.slow
 def test_rocket_draws_its_figures(rocket):
     names = {path.name for path in (rocket / "figures").iterdir()}
     assert names == {"training.png", "trajectory.png", "orbit.png", "animation.gif"}
@@ -591,6 +596,7 @@ def test_action_frame_comes_from_the_checkpoint(rocket, tmp_path, monkeypatch, r
     assert message.startswith("error: --action-frame local: the checkpoint has eci")
 
 
+@pytest.mark.slow
 def test_checkpoint_of_the_other_variant(rocket, tmp_path, capsys):
     """Allowed to begin from, with a line that says so; `--resume` takes no other id at all."""
     run = rocket_run(tmp_path, "--env-id=RocketAscentCutoff-v0", f"--checkpoint={rocket / 'agent.safetensors'}")
@@ -732,6 +738,7 @@ def test_ctrl_c_and_resume(uninterrupted, fresh_folder, monkeypatch, capsys):
     assert_resumes(uninterrupted)
 
 
+@pytest.mark.slow
 def test_a_dispersed_rocket_is_resumed_bit_for_bit(fresh_folder, monkeypatch):
     """With what only it has: the mean flight that it learns, in both networks, and each environment's own vehicle."""
     rocket, argv = importlib.import_module("ppo_gtrxl_rocket"), ["--env-id=TwoStageLEO-v0", "--dispersion=1"]
@@ -829,6 +836,7 @@ REFINES = [*NETWORK, "--num-envs=4", "--num-minibatches=2", "--update-epochs=2",
 REFINES += ["--flights-per-start=2", "--refine-from=0.5", "--total-updates=4"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", ["--noise=schedule", "--log-std-refine=-2"])
 @pytest.mark.parametrize("update", [2, 3, 4])
 def test_resume_before_and_in_the_refinement(fresh_folder, monkeypatch, update, noise):
@@ -853,6 +861,7 @@ def test_resume_before_and_in_the_refinement(fresh_folder, monkeypatch, update, 
     assert_resumes(whole)
 
 
+@pytest.mark.slow
 def test_seconds_of_training_and_of_all(fresh_folder, monkeypatch):
     """An evaluation is no training; both are summed over a resume, which does not count the pause before it."""
     fresh_folder("seconds")
@@ -936,6 +945,7 @@ POSITIVE = "total_updates num_envs num_minibatches update_epochs embed_dim num_h
 POSITIVE += " eval_starts reward_scale max_grad_norm target_kl radius_curriculum flights_per_start"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("module, field", NUMBERS, ids=[field.name for _, field in NUMBERS])
 def test_every_number_has_a_range(refuses, module, field):
     """NaN, infinities and absurd values in every numeric flag, and zero where nothing can be of size zero."""
@@ -1284,6 +1294,7 @@ def test_resume_takes_no_other_flags(refuses, trained, argv):
     assert argv[0].split("=")[0].replace("--no-", "--") in message
 
 
+@pytest.mark.slow
 def test_resume_of_a_finished_run_repeats_its_evaluation(trained, tmp_path, monkeypatch):
     run = Path(shutil.copytree(trained, tmp_path / "run"))
     monkeypatch.chdir(tmp_path)

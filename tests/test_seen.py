@@ -34,16 +34,3 @@ def test_the_shipped_policy(monkeypatch, capsys):
     assert rows[0, 7] < 1 and 3 < rows[-1, 7] < 6
     by_differences, by_tanh = rows[:, 8::2], rows[:, 9::2]
     assert (by_differences <= 1).all() and by_differences[-1, 0] > 0.99 > by_tanh[-1, 0]
-
-
-@pytest.mark.parametrize("path", [RESULTS / "di/agent.safetensors", RESULTS / "rocket_cutoff/agent.safetensors"])
-def test_policies_that_compare_with_no_others_are_refused(monkeypatch, path):
-    with pytest.raises(
-        SystemExit, match=f"checkpoint {path}: its dispersion is 0; it must be of a rocket trained with"
-    ):
-        run(monkeypatch, path)
-
-
-def test_a_checkpoint_that_is_not_there_is_refused(monkeypatch, tmp_path):
-    with pytest.raises(SystemExit, match="nothing: No such file or directory; it must be an agent.safetensors"):
-        run(monkeypatch, tmp_path / "nothing")

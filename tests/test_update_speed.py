@@ -1,12 +1,12 @@
 """`benchmarks/update_speed.py`: its FLOP formula against torch's counter, its gathered windows against the scripts."""
 
-import contextlib
 import importlib
 import re
 
 import pytest
 import torch
-from matplotlib.image import imread
+
+pytestmark = pytest.mark.slow
 
 TINY = {"num_envs": 3, "num_minibatches": 2, "num_blocks": 2, "embed_dim": 8, "num_heads": 2, "memory_length": 20}
 
@@ -16,12 +16,11 @@ def speed():
     return importlib.import_module("update_speed")
 
 
-@pytest.mark.parametrize("size", ["di", "vdp", "rocket"])
-def test_every_script_is_measured(speed, size):
-    """With three episodes; the FLOP by formula are those that torch counts (it leaves out the rocket's features)."""
-    figures = speed.measure(size, 1, 1, changes=TINY)
+def test_a_script_is_measured(speed):
+    """With three episodes; the FLOP by formula are those that torch counts."""
+    figures = speed.measure("di", 1, 1, changes=TINY)
     formula, counted = re.findall(r"[0-9.]+e[+][0-9]+", figures["FLOP of an epoch"])
-    assert float(formula) == pytest.approx(float(counted), rel=0 if size != "rocket" else 0.02)
+    assert float(formula) == float(counted)
     seconds = [float(re.match(r"[0-9.]+", figures[name])[0]) for name in ("rollout", "epoch", "update")]
     assert seconds[0] > 0 and seconds[2] >= seconds[1] > 0
     assert float(re.search(r"([0-9.]+) of the same", figures["FLOP/s"])[1]) < 1.1
@@ -41,23 +40,3 @@ def test_gathered_windows_give_the_same_hidden_states(speed):
     torch.testing.assert_close(gathered, hidden[n, t], rtol=0, atol=1e-5)
     wrong = speed.encode_gathered(bench.agent, obs[n, t], windows.roll(1, dims=2))
     assert (wrong - hidden[n, t]).abs().max() > 1e-3
-
-
-def test_gathered_seconds_of_a_part_are_scaled_to_the_whole(speed, monkeypatch):
-    """3 of 150 samples take less time than an epoch of ours, fifty times as many take several times as long."""
-    monkeypatch.setitem(speed.GATHERED_SAMPLES, "di", 3)
-    gathered = speed.measure("di", 1, 3, changes=TINY)["gathered windows"]
-    assert float(re.search(r"([0-9.]+) times ours", gathered)[1]) > 3
-
-
-@pytest.mark.parametrize("full", [False, True])
-def test_the_figure_of_growth_is_whole_or_as_it_was(speed, full, tmp_path, monkeypatch, request):
-    path = tmp_path / "growth.png"
-    path.write_bytes(b"the old one")
-    monkeypatch.setattr(speed, "median_seconds", lambda call, repeats: (0.1, None))
-    request.getfixturevalue("cut_figures") if full else None
-    monkeypatch.setattr("sys.argv", ["update_speed.py", "--growth", str(path)])
-    with pytest.raises(OSError, match="No space left") if full else contextlib.nullcontext():
-        speed.main()
-    assert len(list(tmp_path.iterdir())) == 1
-    assert path.read_bytes() == b"the old one" if full else imread(path).std() > 0.05

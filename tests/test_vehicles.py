@@ -319,6 +319,7 @@ def solved():
 OWN = ["Single-v0", "ThreeBurns-v0"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env_id", OWN)
 def test_a_rocket_of_your_own_from_reference_to_figures(solved, env_id, tmp_path):
     metrics, arrays, mission = solved[env_id]
@@ -341,6 +342,7 @@ def test_a_rocket_of_your_own_from_reference_to_figures(solved, env_id, tmp_path
     assert [path.name for path in paths] == ["trajectory.png", "orbit.png"] and all(path.exists() for path in paths)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env_id", OWN)
 def test_figures_of_a_rocket_of_your_own(solved, env_id):
     """Labels inside their panel, the whole target orbit, the launch site in its plane, a ceiling where there is one."""

@@ -13,6 +13,8 @@ DOCS = Path(__file__).parents[1] / "docs"
 sys.path.append(str(DOCS))
 import walkthrough  # noqa: E402
 
+pytestmark = pytest.mark.slow
+
 PAGE = walkthrough.PAGE.read_text()
 STEPS = walkthrough.steps(PAGE)
 NUMBER = re.compile(r"-?\d+(?:\.\d*)?")
