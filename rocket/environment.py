@@ -189,7 +189,10 @@ class RocketVectorEnv(BatchedEnv):
         self._end_time = float(value)
         self.episode_steps = int(self._set_ends(self._largest).max())
         # without dispersion all flights share their steps, worked out here for the one vehicle
-        self._table = None if self.dispersion else self._work_out(np.arange(self.episode_steps + 1), self._largest)
+        self._table = None
+        if not self.dispersion:
+            *clock, arc = self._work_out(np.arange(self.episode_steps + 1), self._largest)
+            self._table = np.array(clock), arc
         self._set_ends(self.vehicles)
 
     def _set_ends(self, vehicles):
@@ -283,7 +286,8 @@ class RocketVectorEnv(BatchedEnv):
         """Of the running steps."""
         if self._table is None:
             return self._work_out(self.t, self.vehicles)
-        return Schedule(*(column[self.t] for column in self._table))
+        clock, arc = self._table
+        return Schedule(*clock[:, self.t], arc[self.t])
 
     def _work_out(self, t, vehicles) -> Schedule:
         """Of the steps t (N,) of these vehicles. After an episode's last step phi is still that one's."""
@@ -341,18 +345,23 @@ class RocketVectorEnv(BatchedEnv):
         From event to event: a round flies everyone to the next event or to the end of the duration, then those whom the
         event has met go on in the arc behind it.
         """
-        flown = np.empty_like(y)
-        flying = np.arange(y.shape[1])  # columns of `flown`
+        flown, flying = None, None  # (7, n), and its columns that are still flying: at first all
         while True:
             event = self.vehicles.end[steps.arc, steps.who]
             until_event = event - steps.begin
             y = self._fly_arc(y, steps, np.minimum(duration, until_event))
-            flown[:, flying] = y
-            # a duration is rounded: an event at the step's very end, which the next step takes as past, is not missed
-            met = np.flatnonzero((event <= steps.end) & (duration >= until_event - 1e-9))
+            if flown is None:
+                flown = y
+            else:
+                flown[:, flying] = y
+            met = np.flatnonzero(event <= steps.end)
+            if len(met):
+                # a duration is rounded: an event at the step's very end, which the next step takes as past, is met
+                met = met[(duration >= until_event - 1e-9)[met]]
             if not len(met):
                 return flown
-            y, flying = y[:, met], flying[met]
+            flying = met if flying is None else flying[met]
+            y = y[:, met]
             y[6] -= self.vehicles.dropped[steps.arc[met], steps.who[met]]
             duration = np.maximum((duration - until_event)[met], 0.0)
             steps = steps.of(met)._replace(begin=event[met], arc=steps.arc[met] + 1)
