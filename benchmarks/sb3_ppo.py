@@ -130,7 +130,7 @@ class OurMeanFlight(BaseCallback):
         if not self.constants.mean_flight.any():
             self._come_into_sight()
         batch = SimpleNamespace(obs=torch.as_tensor(self.obs), alive=torch.as_tensor(self.alive))
-        self.script.learn_buffers(self.constants, self.constants, self.args, batch)
+        self.script.update_running_statistics(self.constants, self.constants, self.args, batch)
 
     @torch.no_grad()
     def _come_into_sight(self):

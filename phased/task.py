@@ -97,18 +97,23 @@ class PhasedTask:
         return f"{title} ({metrics['eval_starts']} starts)"
 
     def figures(self, arrays: dict, metrics: dict, curves: list[dict]) -> dict:
-        from drawing.training import Miss, training_figure
         from phased.figures import cost_error_figure, costs_figure, trajectories_figure
 
         problem, title, figures = self.problem, self.headline(metrics), {}
         if curves:
-            miss = Miss("eval/ratio_of_sums", "cost / optimum's, less 1, mean action", subtract=1.0)
-            figures["training.png"] = training_figure(curves, title, metrics["reference_episodic_return"], miss)
+            figures["training.png"] = self.training_figure(metrics, curves)
         figures["trajectories.png"] = trajectories_figure(problem, arrays, title)
         figures["costs.png"] = costs_figure(problem, arrays, title)
         if not problem.waypoints:  # with them a missed circle would count as a gain
             figures["cost_error.png"] = cost_error_figure(problem, arrays, title)
         return figures
+
+    def training_figure(self, metrics: dict, curves: list[dict]):
+        """The curves of a training, with what the mean action costs more than the optimum."""
+        from drawing.training import Miss, training_figure
+
+        miss = Miss("eval/ratio_of_sums", "cost / optimum's, less 1, mean action", subtract=1.0)
+        return training_figure(curves, self.headline(metrics), metrics["reference_episodic_return"], miss)
 
     def animation(self, arrays: dict, metrics: dict):
         from phased.animation import phase_plane_animation
