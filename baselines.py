@@ -10,7 +10,7 @@
 
 Each prints mean costs over random starts and what they are compared with; a rocket has one start. All optima are flown
 once more by the environments.
-Reading order: linear-quadratic optimum, nonlinear programs, references, the small problems' task, command line; the
+Reading order: linear-quadratic optimum, nonlinear programs, references, what they are compared with, command line; the
 rockets' optima are in `rocket/optimum.py`. CasADi and SciPy are imported only where they are used: in a training at its
 start, when it solves the optimum that its evaluations fly.
 """
@@ -29,7 +29,7 @@ from multiprocessing import get_context
 
 import numpy as np
 
-from common.command_line import OneLineParser, integer, output_file
+from common.command_line import OneLineParser, output_file
 from common.errors import BadInput, NoOptimum
 from common.files import replacing
 from common.integration import rk4
@@ -451,7 +451,7 @@ def compare(env_id: str, x0, flight: dict) -> dict:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The small problems' task
+# What is asked of a small problem's id (`phased/task.py`)
 # ---------------------------------------------------------------------------------------------------------------------
 
 
@@ -461,30 +461,21 @@ def kept_reference(problem: Problem, eval_seed: int, n: int) -> dict:
     return reference(problem.env_id, starts(eval_seed, n, problem.x0_max))
 
 
-class SmallProblemTask(PhasedTask):
-    """What is asked of a small problem's id: its optimum here, all else in `phased/task.py`."""
-
-    def optimum(self, eval_seed: int, n: int, **env_options) -> dict:
-        return kept_reference(self.problem, eval_seed, n)
-
-    def add_arguments(self, parser) -> None:
-        parser.add_argument("--starts", type=integer(1, 100_000), default=1000, metavar="N", help="default 1000")
-        parser.add_argument("--seed", type=integer(0, 2**32 - 1), default=0, metavar="S", help="default 0")
-
-    def baseline_command(self, args) -> tuple[dict, dict]:
-        x0 = starts(args.seed, args.starts, self.problem.x0_max)
-        begin = time.perf_counter()
-        flight = reference(self.env_id, x0)
-        seconds = time.perf_counter() - begin
-        numbers = {"env_id": self.env_id, "starts": args.starts, "seed": args.seed, "solve_seconds": seconds}
-        numbers |= summarise(flight) | compare(self.env_id, x0, flight)
-        for key, value in numbers.items():
-            print(f"{key:<32}{value if isinstance(value, str) else format(value, '.7g')}")
-        arrays = {f"{key}_reference": flight[key] for key in ("x", "u", "cost")}
-        return numbers, {"t": self.problem.dt * np.arange(flight["x"].shape[1]), **arrays}
+def report(problem: Problem, n: int, seed: int) -> tuple[dict, dict]:
+    """Solve the n starts of a seed and print the optimum beside what it is compared with: its numbers and arrays."""
+    x0 = starts(seed, n, problem.x0_max)
+    begin = time.perf_counter()
+    flight = reference(problem.env_id, x0)
+    seconds = time.perf_counter() - begin
+    numbers = {"env_id": problem.env_id, "starts": n, "seed": seed, "solve_seconds": seconds}
+    numbers |= summarise(flight) | compare(problem.env_id, x0, flight)
+    for key, value in numbers.items():
+        print(f"{key:<32}{value if isinstance(value, str) else format(value, '.7g')}")
+    arrays = {f"{key}_reference": flight[key] for key in ("x", "u", "cost")}
+    return numbers, {"t": problem.dt * np.arange(flight["x"].shape[1]), **arrays}
 
 
-add_family(PROBLEMS, lambda env_id: SmallProblemTask(PROBLEMS[env_id]))
+add_family(PROBLEMS, lambda env_id: PhasedTask(PROBLEMS[env_id], kept_reference, report))
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -31,7 +31,7 @@ from common.tasks import add_family
 from phased.environment import PhasedEnv, PhasedVectorEnv, fly, make_phased, make_phased_vector
 from phased.problem import PROBLEMS, Phase, Problem
 from rocket.dispersion import DISPERSION, Dispersion, draw_bounds, draw_names, draw_vehicles
-from rocket.dynamics import ascent
+from rocket.dynamics import ascent_dynamics
 from rocket.environment import (
     RocketEnv,
     RocketVectorEnv,
@@ -58,7 +58,7 @@ __all__ = [  # what users import from here
     "DISPERSION", "PAPER_MISSION", "PROBLEMS", "ROCKET", "ROCKETS",
     "BadInput", "BatchedEnv", "Burn", "Dispersion", "Engine", "Mission", "Phase", "PhasedEnv", "PhasedVectorEnv",
     "Problem", "Rocket", "RocketEnv", "RocketVectorEnv", "SingleEnv",
-    "ascent", "delta_v", "draw_bounds", "draw_names", "draw_vehicles", "flown_mission", "fly", "fly_rocket",
+    "ascent_dynamics", "delta_v", "draw_bounds", "draw_names", "draw_vehicles", "flown_mission", "fly", "fly_rocket",
     "launch_raan", "local_frame", "make_phased", "make_phased_vector", "make_rocket", "make_rocket_vector",
     "orbit_vectors", "orbital_elements", "register_rocket", "rk4", "specific_energy", "target_axes", "target_orbit",
     "terminal_error",

@@ -23,7 +23,7 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 import runs
 from envs import ROCKETS
-from rocket.observation import DIFFERENCES, policy_constants
+from rocket.policy_constants import DIFFERENCES, policy_constants
 from rocket.rewards import TERMINAL_SCALE, mass_rewards
 from runs import all_reduce_sum
 

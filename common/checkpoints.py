@@ -1,4 +1,4 @@
-"""Weights in an agent.safetensors, read without torch."""
+"""Reading an agent.safetensors, without torch. `runs.save_run` writes it: the averaged weights, last saved."""
 
 from __future__ import annotations
 

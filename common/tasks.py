@@ -3,7 +3,7 @@
 A *family* is a kind of environment with tables of its own: the small problems (`phased/`), the rockets (`rocket/`).
 `evaluate.py`, `runs.py`, the command of `baselines.py` and the benchmarks call `task_of(env_id)` and never ask which
 family it is. A new family is a folder with a class of this shape, and one line `add_family(TABLES, make_task)` in
-`envs.py`. (The small problems' line is in `baselines.py`, which solves them.)
+`envs.py`. The small problems' line is in `baselines.py`, which solves them: their ids are known once that is imported.
 """
 
 from __future__ import annotations

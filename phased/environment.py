@@ -22,10 +22,13 @@ class PhasedVectorEnv(BatchedEnv):
     """The double integrator and Van der Pol families: N copies of a `Problem` with one or several phases.
 
     Observation: the paper's o_t = [x1, x2, x1_target, x2_target, tau, phi] with several phases, [x1, x2, tau] with one
-    (ours); tau = t / T, phi the 0-based phase over (phases - 1). Action: u, clipped at the control bound. Reward: the
-    paper's r_t, -(dx'Q dx + R u^2) with dx the distance to the phase's target before the step; a phase's last step adds
-    -Qf |dx|^2 + B 1[|dx| <= r] after it, so that an episode's rewards sum to bonus - J. The paper prints r_t for one
-    phase and target 0; that each phase has its own is ours. The end of the horizon is `terminated` (time is observed).
+    (ours); tau = t / T, phi the 0-based phase over (phases - 1). The target that is seen moves to a new waypoint over
+    the first `TRANSITION_STEPS` of its phase. Action: u, clipped at the control bound.
+
+    Reward: the paper's r_t, -(dx'Q dx + R u^2) with dx the distance to the phase's target before the step; a phase's
+    last step adds -Qf |dx|^2 + B 1[|dx| <= r] after it, so that an episode's rewards sum to bonus - J. The paper prints
+    r_t for one phase and target 0; that each phase has its own is ours. The end of the horizon is `terminated` (time is
+    observed).
 
     `final_info`: `episodic_return` (with the true radii), `cost`, `cost_state`, `cost_control`, `cost_terminal`, each
     (N,), and `hit` and `terminal_error` (the distance to the target at each phase's end), each (N, phases).
@@ -90,7 +93,8 @@ class PhasedVectorEnv(BatchedEnv):
         clock = np.stack([np.arange(T + 1) / T, np.append(self._phase, self._phase[-1]) / max(len(phases) - 1, 1)], 1)
         clock *= self.observe_phase
         # what is observed beside x, by step 0..T
-        self._context = np.hstack([np.vstack([seen, targets[-1]]), clock]) if self.problem.waypoints else clock[:, :1]
+        target_and_clock = np.hstack([np.vstack([seen, targets[-1]]), clock])
+        self._seen_beside_x = target_and_clock if self.problem.waypoints else clock[:, :1]
 
     def _start(self, mask, options):
         if options.keys() - {"x0"}:
@@ -108,8 +112,9 @@ class PhasedVectorEnv(BatchedEnv):
         self._terminal_cost[mask] = self._bonus[mask] = self._terminal_error[mask] = 0.0
 
     def _observe(self):
+        """The paper's o_t of the running steps."""
         position, velocity = self.x
-        return np.column_stack([position, velocity * self.observe_velocity, self._context[self.t]])
+        return np.column_stack([position, velocity * self.observe_velocity, self._seen_beside_x[self.t]])
 
     def _advance(self, actions):
         t = self.t

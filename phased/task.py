@@ -1,11 +1,13 @@
-"""What is asked of a small problem's id, but for its optimum, which `baselines.py` solves: see `common.tasks.Task`."""
+"""What is asked of a small problem's id: see `common.tasks.Task`. `baselines.py` gives it the optimum."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
+from common.command_line import integer
 from common.errors import BadInput
 from phased.environment import fly
 from phased.metrics import comparable, flight_metrics, near_origin_metrics, ratio_metrics
@@ -20,13 +22,15 @@ class PhasedTask:
     """A problem in `PROBLEMS`, measured over starts in its box."""
 
     problem: Problem
+    solve: Callable  # (problem, eval_seed, n) -> the optimum's flights from the n starts of a seed
+    report: Callable  # (problem, starts, seed) -> the numbers and arrays of the printed optimum
 
     @property
     def env_id(self) -> str:
         return self.problem.env_id
 
     def optimum(self, eval_seed: int, n: int, **env_options) -> dict:
-        raise NotImplementedError  # baselines.py
+        return self.solve(self.problem, eval_seed, n)
 
     # --- flying and measuring
 
@@ -135,10 +139,11 @@ class PhasedTask:
         return [("", {}, None)]
 
     def add_arguments(self, parser) -> None:
-        raise NotImplementedError  # baselines.py
+        parser.add_argument("--starts", type=integer(1, 100_000), default=1000, metavar="N", help="default 1000")
+        parser.add_argument("--seed", type=integer(0, 2**32 - 1), default=0, metavar="S", help="default 0")
 
     def baseline_command(self, args) -> tuple[dict, dict]:
-        raise NotImplementedError  # baselines.py
+        return self.report(self.problem, args.starts, args.seed)
 
     def fly_opponents(self, folder, **options) -> None:
         raise BadInput(f"the env_id of {folder} is {self.env_id}; it must be a rocket's with cut-off")

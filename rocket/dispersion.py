@@ -35,6 +35,7 @@ OF_FLIGHT = ("payload", "drag", "wind_east", "wind_north")
 LARGEST_SCORE = 3.0  # drawn scores are clipped there
 LARGEST_CHANGE = 0.9  # part of its nominal value by which a drawn factor or payload may differ: nothing vanishes
 LARGEST_DISPERSION = 100.0
+WIND_ALTITUDE, WIND_DEPTH = 12e3, 5e3  # m, of the profile exp(-((h - altitude) / depth)^2): ours
 
 
 class Vehicles(NamedTuple):
@@ -48,7 +49,7 @@ class Vehicles(NamedTuple):
     flow: np.ndarray  # (A, N) kg/s
     dropped: np.ndarray  # (A, N) kg at the arc's end
     burn_out: np.ndarray  # (N,) s: when the last stage has burnt what the nominal one burns, or runs dry
-    wind: np.ndarray  # (2, N) m/s, towards east and north where the profile is 1
+    wind: np.ndarray  # (2, N) m/s, towards east and north where the profile of `wind_velocity` is 1
     drag: np.ndarray  # (N,) factor on the drag
 
 
@@ -205,6 +206,16 @@ def nominal_vehicles(rocket: Rocket, number: int) -> Vehicles:
     numbers = [rocket.x0[6], rocket.dry_mass, sum(n * engine.propellant for n, engine in rocket.burns[-1].engines)]
     columns = [*numbers, np.append(end[:-1], np.inf), thrust, flow, dropped, rocket.burns[-1].end, np.zeros(2), 1.0]
     return Vehicles(*(np.repeat(np.asarray(column)[..., None], number, axis=-1) for column in columns))
+
+
+def wind_velocity(place, wind, rocket: Rocket = ROCKET):
+    """The wind in ECI, m/s by components, at (rx, ry, rz, |r|) in m; wind: (east, north) where the profile is 1."""
+    rx, ry, rz, r = place
+    profile = np.exp(-(((r - (rocket.Re + WIND_ALTITUDE)) / WIND_DEPTH) ** 2))
+    axis = (rx * rx + ry * ry) ** 0.5 + 1e-9  # m from the Earth's axis; over a pole nothing is east, nor NaN
+    east, north = profile * wind[0] / axis, profile * wind[1] / r
+    south = north * rz / axis
+    return -east * ry - south * rx, east * rx - south * ry, north * axis
 
 
 def check_drawable(rocket: Rocket):

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from rocket.dispersion import wind_velocity
 from rocket.vehicle import ROCKET, Rocket
 
-WIND_ALTITUDE, WIND_DEPTH = 12e3, 5e3  # m, of the profile exp(-((h - altitude) / depth)^2): ours
 
-
-def ascent(x, u, rocket: Rocket = ROCKET, wind=None, drag_factor=None):
+def ascent_dynamics(x, u, rocket: Rocket = ROCKET, wind=None, drag_factor=None):
     """r' = v, v' = -mu r / |r|^3 + T u / m + D / m, m' = -flow ("Multiphase Rocket Ascent Problem").
 
     D = -1/2 rho Cd S |v_rel| v_rel, rho = rho0 exp(-h / H), v_rel = v - omega_e x r. x: r, v, m by components; u: the
@@ -35,13 +34,3 @@ def ascent(x, u, rocket: Rocket = ROCKET, wind=None, drag_factor=None):
     ay = gravity * ry + push * uy + drag * wy
     az = gravity * rz + push * uz + drag * wz
     return vx, vy, vz, ax, ay, az, -flow
-
-
-def wind_velocity(place, wind, rocket: Rocket = ROCKET):
-    """The wind in ECI, m/s by components, at (rx, ry, rz, |r|) in m; wind: (east, north) where the profile is 1."""
-    rx, ry, rz, r = place
-    profile = np.exp(-(((r - (rocket.Re + WIND_ALTITUDE)) / WIND_DEPTH) ** 2))
-    axis = (rx * rx + ry * ry) ** 0.5 + 1e-9  # m from the Earth's axis; over a pole nothing is east, nor NaN
-    east, north = profile * wind[0] / axis, profile * wind[1] / r
-    south = north * rz / axis
-    return -east * ry - south * rx, east * rx - south * ry, north * axis

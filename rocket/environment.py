@@ -25,7 +25,7 @@ from rocket.dispersion import (
     largest_draw,
     nominal_vehicles,
 )
-from rocket.dynamics import ascent
+from rocket.dynamics import ascent_dynamics
 from rocket.missions import PAPER_MISSION, ROCKETS, Mission
 from rocket.orbits import (
     local_frame,
@@ -287,7 +287,8 @@ class RocketVectorEnv(BatchedEnv):
         if self._table is None:
             return self._work_out(self.t, self.vehicles)
         clock, arc = self._table
-        return Schedule(*clock[:, self.t], arc[self.t])
+        begin, end, phi = clock[:, self.t]
+        return Schedule(begin, end, phi, arc[self.t])
 
     def _work_out(self, t, vehicles) -> Schedule:
         """Of the steps t (N,) of these vehicles. After an episode's last step phi is still that one's."""
@@ -376,7 +377,7 @@ class RocketVectorEnv(BatchedEnv):
         controls = (*steps.u, self.vehicles.thrust[arc, who], self.vehicles.flow[arc, who])
         drag, wind = (self.vehicles.drag[who], self.vehicles.wind[:, who]) if self.dispersion else (None, None)
         # the state as one component (7, n): rk4 then takes a seventh of the array operations
-        f = lambda x, u: (np.array(ascent(x[0], u, rocket, wind, drag)),)  # noqa: E731
+        f = lambda x, u: (np.array(ascent_dynamics(x[0], u, rocket, wind, drag)),)  # noqa: E731
         speed = np.sqrt((y[3:6] ** 2).sum(axis=0))
         lowest = np.maximum(np.sqrt((y[:3] ** 2).sum(axis=0)) - rocket.Re - speed * dt, 0.0)
         rate = rocket.rho0 * np.exp(-lowest / rocket.H) * rocket.Cd * rocket.S * speed / y[6]

@@ -244,7 +244,7 @@ def optimise_remaining(rocket: Rocket, remaining: RemainingAscent, guess: dict, 
     states = interpolate(np.append(t[1:], t_u), guess["t"], guess["y"]) / scale
     directions = interpolate(t_u, guess["t_u"], guess["u"])
     w = np.concatenate([states.ravel(), directions.ravel(), [t[-1] - ignition]])
-    box = np.full(len(w) - 1, 2.0)  # as in ascend
+    box = np.full(len(w) - 1, 2.0)  # as in solve_from_guess
     equal, radius = np.zeros(n * (7 * points + 6) + 5), np.full(n, 1 + 1 / rocket.Re)
     bounds = {"lbx": np.append(-box, 0.0), "ubx": np.append(box, remaining.end[-1] - ignition)}
     bounds |= {"lbg": np.append(equal, radius), "ubg": np.append(equal, np.full(n, np.inf))}

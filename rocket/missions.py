@@ -1,6 +1,7 @@
 """Missions: a vehicle and the rules that it flies by, under an environment id.
 
-`ROCKETS` is what environments, references, evaluation, figures and the script read; `register_rocket` adds to it.
+`ROCKETS` is what environments, references, evaluation, figures and the script read; `register_rocket` adds to it. The
+target orbit is the `Rocket`'s own (`vehicle.py`); what counts as a success is in `metrics.py`.
 """
 
 from __future__ import annotations
@@ -42,4 +43,4 @@ class Mission:
 # the paper penalises an overshoot beyond 250 km; until 150.4 s the boosters burn; at the fixed time speed has to be
 # wasted, and too flat a climb wastes it as well: with a floor of 110 km two of three seeds flew along it
 PAPER_MISSION = Mission(ROCKET, ceiling_km=250.0, floor_km=130.0, guided_until=ROCKET.burns[1].end, mass_unit=100.0)
-ROCKETS: dict[str, Mission] = {}  # by environment id
+ROCKETS: dict[str, Mission] = {}  # by environment id; `envs.py` and the files of `vehicles/` fill it

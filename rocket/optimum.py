@@ -20,7 +20,7 @@ from common.errors import NoOptimum
 from common.files import DAMAGED_NPZ
 from common.integration import rk4
 from common.ipopt import interruptible
-from rocket.dynamics import ascent
+from rocket.dynamics import ascent_dynamics
 from rocket.environment import flown_mission, fly_rocket
 from rocket.missions import PAPER_MISSION, ROCKETS, Mission
 from rocket.orbits import local_frame, orbit_vectors, target_axes, target_orbit, terminal_error
@@ -116,7 +116,7 @@ def collocation(rocket: Rocket, in_wind: bool = False):
             (*ca.vertsplit(scale * z[:, j]), mass - flow * tau[j] * dt),
             (*ca.vertsplit(u[:, j]), thrust, flow),
         )
-        rates.append(ca.vertcat(*ascent(state, control, rocket, wind or None, drag)[:6]) / scale)
+        rates.append(ca.vertcat(*ascent_dynamics(state, control, rocket, wind or None, drag)[:6]) / scale)
     nodes = ca.horzcat(x, z)
     defects = nodes @ C - dt * ca.horzcat(*rates)
     parameters = ca.vertcat(*engine, *air)
@@ -131,7 +131,7 @@ def zero_order_hold_step(rocket: Rocket):
     x, u = ca.SX.sym("x", 6), ca.SX.sym("u", 3)
     mass, thrust, flow, dt = engine = ca.vertsplit(ca.SX.sym("engine", 4))
     state, control = (*ca.vertsplit(scale * x), mass), (*ca.vertsplit(u), thrust, flow)
-    x_next = rk4(lambda x, u: ascent(x, u, rocket), state, control, dt)
+    x_next = rk4(lambda x, u: ascent_dynamics(x, u, rocket), state, control, dt)
     none = ca.SX(6, 0)
     return ca.Function("zoh_step", [x, none, u, ca.vertcat(*engine)], [none, ca.vertcat(*x_next[:6]) / scale])
 
@@ -187,7 +187,7 @@ def interpolate(times, t, values):
 
 
 @interruptible()
-def ascend(case: AscentCase, mesh: Mesh, guess: dict) -> dict:
+def solve_from_guess(case: AscentCase, mesh: Mesh, guess: dict) -> dict:
     """Solve `ascent_program` from a guess with t (s), y (its states, at least r and v), t_u (s), u (directions).
 
     Returns the same of the optimum (y (n+1, 6)), `status`, `final_time`, `final_mass`, and `costate` (m, 3), the
@@ -297,7 +297,7 @@ def refuse_too_weak(case: AscentCase):
 
 
 def optimise_ascent(case: AscentCase, segments: int = SEGMENTS) -> dict:
-    """The optimum from the first of `ascent_guesses` that IPOPT takes there: what `ascend` returns.
+    """The optimum from the first of `ascent_guesses` that IPOPT takes there: what `solve_from_guess` returns.
 
     With free final time by direct collocation, else by the environment's own steps. Raises RuntimeError that says what
     to look at where there is none.
@@ -308,7 +308,7 @@ def optimise_ascent(case: AscentCase, segments: int = SEGMENTS) -> dict:
         end = end if case.free else rocket.end_time
         mesh = collocation_mesh(case, end, segments) if case.free else zero_order_hold_mesh(rocket, end)
         try:
-            return ascend(case, mesh, cold_start(case, end, tilt_time))
+            return solve_from_guess(case, mesh, cold_start(case, end, tilt_time))
         except NoOptimum as error:
             failure = error
     launch_plane = launch_raan(rocket.latitude, rocket.i)
@@ -352,7 +352,7 @@ def nine_pitch_angles(env_id: str, flight: dict, rocket: Rocket) -> dict:
 
 
 @cache
-def solve_ascent(case: AscentCase):
+def solve_and_fly(case: AscentCase):
     """One ascent: its numbers, its flight by the environment, and the collocation (None if the time is fixed).
 
     With free final time the collocation's directions at mid-step are held over the environment's steps; with fixed time
@@ -406,7 +406,7 @@ def mission_reference(env_id: str, mission: Mission) -> dict:
     case = reference_case(env_id, mission)
     found = stored_reference(env_id, case) if mission == ROCKETS[env_id] else None
     if found is None:
-        numbers, solved, _ = solve_ascent(case)
+        numbers, solved, _ = solve_and_fly(case)
         found = numbers, fly_directions(env_id, case.rocket, solved["u"], solved["t"][-1])
     numbers, flight = found
     return flight | {

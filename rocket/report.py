@@ -14,7 +14,7 @@ from rocket.optimum import (
     mission_case,
     nine_pitch_angles,
     optimise_ascent,
-    solve_ascent,
+    solve_and_fly,
 )
 
 COLUMNS = ("final_mass_kg", "final_time_s", "error_norm", "replay_error_norm", "max_altitude_km", "solve_seconds")
@@ -41,7 +41,7 @@ def solve_and_print(cases: dict) -> tuple[dict, dict, dict]:
     print(f"{'':<16}" + "".join(f"{name:>19}" for name in COLUMNS) + "  status")
     numbers, flights, optima = {}, {}, {}
     for key, case in cases.items():
-        numbers[key], flights[key], optima[key] = solve_ascent(case)
+        numbers[key], flights[key], optima[key] = solve_and_fly(case)
         cells = "".join(f"{numbers[key][name]:>19.10g}" for name in COLUMNS)
         print(f"{key:<16}{cells}  {numbers[key]['status']}", flush=True)
     return numbers, flights, optima

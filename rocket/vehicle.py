@@ -341,7 +341,10 @@ def check_rocket(rocket: Rocket):
 
 
 def check_burns(rocket: Rocket):
-    """BadInput where the burns are not in order, burn what is not aboard, or longer than their propellant lasts."""
+    """BadInput where the burns are not in order, burn what is not aboard, or more than all engines of a type hold.
+
+    With `table_isp` the last burn may run dry.
+    """
     refuse_unless(isinstance(rocket.burns, tuple), "a rocket's burns", rocket.burns, "must be a tuple")
     refuse_unless(rocket.burns, "a rocket's burns", rocket.burns, "must hold at least one burn")
     start = 0.0

@@ -14,7 +14,7 @@ from gymnasium.utils.env_checker import check_env
 from rocket_oracle import CUTOFF, FIXED, LEO, MU, OMEGA, RE, between_events, energy
 
 import envs
-from envs import ROCKET, ROCKETS, BadInput, ascent, fly_rocket
+from envs import ROCKET, ROCKETS, BadInput, ascent_dynamics, fly_rocket
 from rocket.dispersion import DRAW
 from rocket.vehicle import STAGE_1, STAGE_2, engine_groups
 
@@ -511,7 +511,7 @@ def acceleration(altitude, latitude=0.0, **air):
     """Up, east and north of what `ascent` adds to gravity at rest over the ground, without thrust."""
     c, s, r = math.cos(latitude), math.sin(latitude), RE + altitude
     state = (r * c, 0.0, r * s, 0.0, OMEGA * r * c, 0.0, 1e3)
-    a = np.array(ascent(state, (1.0, 0, 0, 0.0, 0.0), **air)[3:6]) + MU / r**2 * np.array([c, 0, s])
+    a = np.array(ascent_dynamics(state, (1.0, 0, 0, 0.0, 0.0), **air)[3:6]) + MU / r**2 * np.array([c, 0, s])
     return a @ np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]).T
 
 
@@ -575,11 +575,11 @@ def test_ascent_takes_casadi_symbols_with_wind():
     casadi = pytest.importorskip("casadi")
     x, wind, factor = casadi.SX.sym("x", 7), casadi.SX.sym("w", 2), casadi.SX.sym("f")
     u = (0.6, 0.0, 0.8, 1e6, 300.0)
-    f = casadi.Function("f", [x, wind, factor], [casadi.vertcat(*ascent(
+    f = casadi.Function("f", [x, wind, factor], [casadi.vertcat(*ascent_dynamics(
         casadi.vertsplit(x), u, ROCKET, casadi.vertsplit(wind), factor))])  # fmt: skip
     state = ROCKET.x0 + [500.0, 200.0, 9000.0, 30.0, 20.0, -40.0, -5000.0]
     got = np.array(f(state, [30.0, -20.0], 1.2))[:, 0]
-    np.testing.assert_allclose(got, ascent(tuple(state), u, ROCKET, (30.0, -20.0), 1.2), rtol=1e-13)
+    np.testing.assert_allclose(got, ascent_dynamics(tuple(state), u, ROCKET, (30.0, -20.0), 1.2), rtol=1e-13)
 
 
 # --- refusals and extremes --------------------------------------------------------------------------------------------

@@ -17,7 +17,7 @@ from rocket_oracle import single_burn
 import baselines
 import envs
 from envs import ROCKET, ROCKETS, fly_rocket, rk4
-from envs import ascent as dynamics
+from envs import ascent_dynamics as dynamics
 from rocket import optimum, report
 from rocket.optimum import ASCENTS, STORED, nine_pitch_angles, rocket_reference
 
@@ -101,8 +101,8 @@ def test_drag_costs_mass(command):
 
 def test_solving_twice_gives_the_same_bits(command):
     _, numbers, arrays = command
-    optimum.solve_ascent.cache_clear()
-    again, flight, _ = optimum.solve_ascent(ASCENTS["free"])
+    optimum.solve_and_fly.cache_clear()
+    again, flight, _ = optimum.solve_and_fly(ASCENTS["free"])
     assert {**again, "solve_seconds": 0} == {**numbers["free"], "solve_seconds": 0}
     np.testing.assert_array_equal(flight["u"], arrays["free_u"])
 
@@ -181,7 +181,7 @@ def refuse(case):
 
 @pytest.mark.parametrize("env_id", ["RocketAscent-v0", "RocketAscentCutoff-v0", "TwoStageLEO-v0"])
 def test_reference_is_the_solve(command, flights, shipped, monkeypatch, env_id):
-    monkeypatch.setattr(optimum, "solve_ascent", refuse)
+    monkeypatch.setattr(optimum, "solve_and_fly", refuse)
     _, numbers, _ = command
     key, found = STORED.get(env_id, env_id), rocket_reference(env_id)
     assert found["reference_mass_kg"] == numbers[key]["final_mass_kg"]
@@ -243,7 +243,7 @@ def test_reference_is_solved_anew_where_the_files_do_not_serve(command, flights,
         solved.append(case.key)
         return command[1][case.key], flights[case.key], None
 
-    monkeypatch.setattr(optimum, "solve_ascent", solve)
+    monkeypatch.setattr(optimum, "solve_and_fly", solve)
     found = rocket_reference("RocketAscentCutoff-v0")
     assert solved == ["free"] and found["error_norm"] < 2e-5
     assert found["reference_mass_kg"] == command[1]["free"]["final_mass_kg"]
@@ -349,7 +349,7 @@ def test_another_ceiling_is_another_reference(monkeypatch, flights, ceiling_km):
     """The paper's id with another ceiling, or none, does not find the stored optimum below 250 km."""
     solved = []
     numbers = {"final_mass_kg": 6644.0, "final_time_s": 961.0}
-    monkeypatch.setattr(optimum, "solve_ascent", lambda case: solved.append(case) or (numbers, flights["fixed"], None))
+    monkeypatch.setattr(optimum, "solve_and_fly", lambda case: solved.append(case) or (numbers, flights["fixed"], None))
     monkeypatch.setitem(ROCKETS, "RocketAscent-v0", replace(ROCKETS["RocketAscent-v0"], ceiling_km=ceiling_km))
     found = rocket_reference("RocketAscent-v0")
     assert found["max_altitude_km"] > 250.1, "the flight without a ceiling"
@@ -359,7 +359,7 @@ def test_another_ceiling_is_another_reference(monkeypatch, flights, ceiling_km):
 @pytest.mark.parametrize("changed", [{"cutoff": False}, {"cutoff": False, "ceiling_km": 300.0}])
 def test_another_rule_of_a_vehicle_is_another_reference(monkeypatch, changed):
     """Its stored optimum still reaches the orbit: earlier than at the end time, and above the ceiling."""
-    monkeypatch.setattr(optimum, "solve_ascent", refuse)
+    monkeypatch.setattr(optimum, "solve_and_fly", refuse)
     env_id = "TwoStageLEO-v0"
     rocket_reference(env_id)
     monkeypatch.setitem(ROCKETS, env_id, replace(ROCKETS[env_id], **changed))
@@ -370,7 +370,7 @@ def test_another_rule_of_a_vehicle_is_another_reference(monkeypatch, changed):
 def test_options_change_what_is_solved(monkeypatch, flights):
     solved = []
     numbers = {"final_mass_kg": 7000.0, "final_time_s": 924.0}
-    monkeypatch.setattr(optimum, "solve_ascent", lambda case: solved.append(case) or (numbers, flights["free"], None))
+    monkeypatch.setattr(optimum, "solve_and_fly", lambda case: solved.append(case) or (numbers, flights["free"], None))
     mine = replace(ROCKET, payload=4000.0)
     rocket_reference("RocketAscentCutoff-v0", rocket=mine)
     rocket_reference("RocketAscentCutoff-v0", table_isp=True)
@@ -397,7 +397,7 @@ def test_an_infeasible_ascent_is_an_error_of_one_line(changes, names):
 
 def test_a_rocket_without_the_energy_is_refused_before_any_solve(monkeypatch):
     """Its delta-v by Tsiolkovsky: 3.0 and 3.4 km/s times the mass ratios' logarithms, and 359 m/s of turning Earth."""
-    monkeypatch.setattr(optimum, "ascend", None)
+    monkeypatch.setattr(optimum, "solve_from_guess", None)
     m0 = 433e3 + 111.5e3 + 45e3
     delta_v = 7.6e6 * 162 / 411e3 * math.log(m0 / (m0 - 411e3))
     delta_v += 934e3 * 393 / 107.5e3 * math.log((111.5e3 + 45e3) / (4e3 + 45e3))
@@ -409,10 +409,10 @@ def test_a_rocket_without_the_energy_is_refused_before_any_solve(monkeypatch):
 
 def test_a_flight_that_misses_is_an_error(flights, monkeypatch):
     early = {"u": flights["fixed"]["u"], "final_time": 960.0}
-    monkeypatch.setattr(optimum, "ascend", lambda case, mesh, guess: early)
-    optimum.solve_ascent.cache_clear()
+    monkeypatch.setattr(optimum, "solve_from_guess", lambda case, mesh, guess: early)
+    optimum.solve_and_fly.cache_clear()
     with pytest.raises(RuntimeError, match="rocket ascent fixed: flown by the environment it misses by 0.0"):
-        optimum.solve_ascent(ASCENTS["fixed"])
+        optimum.solve_and_fly(ASCENTS["fixed"])
 
 
 def test_nothing_is_written_unless_asked(tmp_path, monkeypatch):

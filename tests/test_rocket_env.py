@@ -32,7 +32,7 @@ from rocket_oracle import (
     unit,
 )
 
-from envs import ROCKETS, RocketVectorEnv, ascent, fly_rocket, local_frame, rk4
+from envs import ROCKETS, RocketVectorEnv, ascent_dynamics, fly_rocket, local_frame, rk4
 
 REGISTERED, IDS = [FIXED, CUTOFF, LEO], [FIXED, CUTOFF, LEO_FIXED, LEO]
 KEYS = {
@@ -154,7 +154,7 @@ def test_coast_conserves_energy_and_angular_momentum(v):
     # the same by the integrator alone, along a quarter of the orbit and back
     s, rocket = (*v.on_goal_orbit(0.0), 1000.0), dry_vehicle(v)
     for dt in [4.0] * 1000 + [-4.0] * 1000:
-        s = rk4(lambda x, u: ascent(x, u, rocket), s, (1.0, 0.0, 0.0, 0.0, 0.0), dt)
+        s = rk4(lambda x, u: ascent_dynamics(x, u, rocket), s, (1.0, 0.0, 0.0, 0.0, 0.0), dt)
         assert energy(s) == pytest.approx(v.goal_energy, rel=1e-9)
     np.testing.assert_allclose(s[:3], v.on_goal_orbit(0.0)[:3], atol=1.0)
 
@@ -186,7 +186,7 @@ def test_air_turns_with_the_earth(v, side):
     moving = [*v.start[:3], *(a + b for a, b in zip(v.start[3:6], wind)), 1e5]
     off = (1.0, 0.0, 0.0, 0.0, 0.0)
     gravity = -MU / RE**3 * np.array(v.start[:3])
-    drag = [np.array(ascent(s, off, ROCKETS[v.cutoff].rocket)[3:6]) - gravity for s in (still, ground, moving)]
+    drag = [np.array(ascent_dynamics(s, off, ROCKETS[v.cutoff].rocket)[3:6]) - gravity for s in (still, ground, moving)]
     pressure = 0.5 * 1.225 * 0.5 * v.area / 1e5
     np.testing.assert_allclose(drag[0], [0, pressure * v.start[4] ** 2, 0], rtol=1e-12, atol=1e-13)
     np.testing.assert_allclose(drag[1], 0, atol=1e-13)

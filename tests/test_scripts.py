@@ -30,9 +30,9 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 import baselines
 import envs
 import runs
-from baselines import SmallProblemTask
 from common.errors import NoOptimum
 from drawing import animation
+from phased.task import PhasedTask
 
 torch.set_num_threads(1)
 ROOT = Path(__file__).parent.parent
@@ -412,8 +412,8 @@ def test_eval_only_defaults(trained, tmp_path, monkeypatch):
         policy(np.zeros((n, 3)), 0)
         return {"env_id": task.env_id}, {}
 
-    monkeypatch.setattr(SmallProblemTask, "evaluate", evaluate)
-    monkeypatch.setattr(SmallProblemTask, "table", lambda task, metrics: "")
+    monkeypatch.setattr(PhasedTask, "evaluate", evaluate)
+    monkeypatch.setattr(PhasedTask, "table", lambda task, metrics: "")
     DI.main(["--eval-only", f"--checkpoint={trained / 'agent.safetensors'}", "--embed-dim=8", "--eval-seed=7"])
     assert asked == [("DoubleIntegrator-v0", 7, 1000, {"observe_phase": False, "observe_velocity": True})]
     assert os.listdir() == []
@@ -442,8 +442,8 @@ def test_log_std_of_a_checkpoint_and_of_the_user(trained, fresh_folder, monkeypa
 
 def test_eval_every_uses_starts_of_its_own(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    seeds, evaluate = [], SmallProblemTask.evaluate
-    monkeypatch.setattr(SmallProblemTask, "evaluate", lambda *a, **k: [seeds.append(a[2]), evaluate(*a, **k)][1])
+    seeds, evaluate = [], PhasedTask.evaluate
+    monkeypatch.setattr(PhasedTask, "evaluate", lambda *a, **k: [seeds.append(a[2]), evaluate(*a, **k)][1])
     DI.main([*TINY, "--total-updates=3", "--eval-every=2", "--eval-seed=5"])
     assert len(seeds) == 2 and seeds[1] == 5
     assert seeds[0] > runs.RANGES["eval_seed"][1]  # no --eval-seed reaches it
@@ -865,8 +865,8 @@ def test_resume_before_and_in_the_refinement(fresh_folder, monkeypatch, update, 
 def test_seconds_of_training_and_of_all(fresh_folder, monkeypatch):
     """An evaluation is no training; both are summed over a resume, which does not count the pause before it."""
     fresh_folder("seconds")
-    evaluate = SmallProblemTask.evaluate
-    monkeypatch.setattr(SmallProblemTask, "evaluate", lambda *a, **k: [time.sleep(0.3), evaluate(*a, **k)][1])
+    evaluate = PhasedTask.evaluate
+    monkeypatch.setattr(PhasedTask, "evaluate", lambda *a, **k: [time.sleep(0.3), evaluate(*a, **k)][1])
     stop_in_update(monkeypatch, 3, KeyboardInterrupt())
     began = time.time()
     with pytest.raises(KeyboardInterrupt):

@@ -211,7 +211,7 @@ def test_foreign_ids_are_refused(env_id):
 def test_registering_again_replaces(monkeypatch):
     """Environment, reference and evaluation are the new rocket's, with a warning where it is another one."""
     solved = []
-    monkeypatch.setattr(optimum, "solve_ascent", lambda case: solved.append(case.rocket) or 1 / 0)
+    monkeypatch.setattr(optimum, "solve_and_fly", lambda case: solved.append(case.rocket) or 1 / 0)
     lighter = replace(TWO, payload=19e3)
     for rocket in (TWO, lighter):
         with warnings.catch_warnings(record=True) as caught:
@@ -238,7 +238,7 @@ def test_evaluation_does_not_keep_the_optimum_of_a_replaced_rocket(monkeypatch):
     def solve(case):
         return {"final_mass_kg": case.rocket.payload, "final_time_s": 1.0}, flight, None
 
-    monkeypatch.setattr(optimum, "solve_ascent", solve)
+    monkeypatch.setattr(optimum, "solve_and_fly", solve)
     monkeypatch.setattr(optimum, "nine_pitch_angles", lambda *inputs: {"error_norm": 1.0})
     for payload in (20e3, 19e3):
         register_rocket("Again-v0", replace(TWO, payload=payload))
@@ -416,7 +416,7 @@ def test_evaluation_is_against_the_rocket_that_flies(monkeypatch, option):
         flight = envs.fly_rocket(CUTOFF, lambda obs, t: np.array([[1.0, 0.1, 0.0]]), end_time=100.0, rocket=flown)
         return {"final_mass_kg": 4321.0, "final_time_s": 100.0}, flight, None
 
-    monkeypatch.setattr(optimum, "solve_ascent", solve)
+    monkeypatch.setattr(optimum, "solve_and_fly", solve)
     policy = lambda obs, t: np.array([[1.0, 0.3, 0.0]])  # noqa: E731
     metrics, arrays = evaluate.evaluate(CUTOFF, policy, 0, 1, action_frame="local", **option)
     assert solved == [flown] and metrics["reference_mass_kg"] == 4321.0

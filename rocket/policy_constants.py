@@ -1,4 +1,4 @@
-"""What a policy is given of a rocket, beside the observation."""
+"""What a policy is given of a rocket beside its observations: constants that are saved with its weights."""
 
 from __future__ import annotations
 
