@@ -31,7 +31,7 @@ import numpy as np
 
 from common.command_line import OneLineParser, output_file
 from common.errors import BadInput, NoOptimum
-from common.files import replacing
+from common.files import replacing, write_npz
 from common.integration import rk4
 from common.ipopt import interruptible
 from common.tasks import add_family, env_ids, task_of
@@ -456,26 +456,27 @@ def compare(env_id: str, x0, flight: dict) -> dict:
 
 
 @lru_cache(maxsize=4)
-def kept_reference(problem: Problem, eval_seed: int, n: int) -> dict:
+def kept_reference(env_id: str, problem: Problem, eval_seed: int, n: int) -> dict:
     """`reference` from the n starts of a seed: evaluations during a training fly the same starts again and again."""
-    return reference(problem.env_id, starts(eval_seed, n, problem.x0_max))
+    return reference(env_id, starts(eval_seed, n, problem.x0_max))
 
 
-def report(problem: Problem, n: int, seed: int) -> tuple[dict, dict]:
+def report(env_id: str, n: int, seed: int) -> tuple[dict, dict]:
     """Solve the n starts of a seed and print the optimum beside what it is compared with: its numbers and arrays."""
+    problem = PROBLEMS[env_id]
     x0 = starts(seed, n, problem.x0_max)
     begin = time.perf_counter()
-    flight = reference(problem.env_id, x0)
+    flight = reference(env_id, x0)
     seconds = time.perf_counter() - begin
-    numbers = {"env_id": problem.env_id, "starts": n, "seed": seed, "solve_seconds": seconds}
-    numbers |= summarise(flight) | compare(problem.env_id, x0, flight)
+    numbers = {"env_id": env_id, "starts": n, "seed": seed, "solve_seconds": seconds}
+    numbers |= summarise(flight) | compare(env_id, x0, flight)
     for key, value in numbers.items():
         print(f"{key:<32}{value if isinstance(value, str) else format(value, '.7g')}")
     arrays = {f"{key}_reference": flight[key] for key in ("x", "u", "cost")}
     return numbers, {"t": problem.dt * np.arange(flight["x"].shape[1]), **arrays}
 
 
-add_family(PROBLEMS, lambda env_id: PhasedTask(PROBLEMS[env_id], kept_reference, report))
+add_family(PROBLEMS, lambda env_id: PhasedTask(env_id, PROBLEMS[env_id], kept_reference, report))
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -496,8 +497,7 @@ def save(args, numbers: dict, arrays: dict) -> None:
         with replacing(args.json, "w") as file:
             json.dump(numbers, file, indent=2)
     if args.npz:
-        with replacing(args.npz) as file:
-            np.savez_compressed(file, **arrays)
+        write_npz(args.npz, arrays)
 
 
 def parse_args(argv=None):
@@ -506,7 +506,7 @@ def parse_args(argv=None):
     commands = parser.add_subparsers(dest="command", required=True)
     for env_id in env_ids():
         names = [SHORT_NAMES[env_id]] if env_id in SHORT_NAMES else []
-        command = commands.add_parser(env_id, aliases=names, help="its optima")
+        command = commands.add_parser(env_id, aliases=names, help=f"the optimum of {env_id}")
         task_of(env_id).add_arguments(command)
         command.set_defaults(solve=task_of(env_id).baseline_command)
     command = commands.add_parser("rocket", help="the optima of all rockets")

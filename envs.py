@@ -23,6 +23,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import gymnasium as gym
+import numpy as np  # noqa: F401 - for the dynamics of your own
 
 from common.batch import BatchedEnv, SingleEnv
 from common.errors import BadInput
@@ -142,8 +143,8 @@ PROBLEMS |= {
 for _env_id in PROBLEMS:
     gym.register(
         id=_env_id,
-        entry_point="phased.environment:make_phased",
-        vector_entry_point="phased.environment:make_phased_vector",
+        entry_point="envs:make_phased",
+        vector_entry_point="envs:make_phased_vector",
         kwargs={"env_id": _env_id},
     )
 

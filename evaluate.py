@@ -76,7 +76,7 @@ def publish(run_dir, folder, ship: bool = False, numbers: bool = False):
             redraw(staged)
             animate(staged)
             keep_excerpt(staged / "eval.npz", task_of(metrics["env_id"]))
-        move(staged, folder, last, replaced=OF_ONE_POLICY if ships else ())
+        move(staged, folder, last, replaced=of_another_policy(folder) if ships else ())
 
 
 def keep_excerpt(path, task):
@@ -87,7 +87,9 @@ def keep_excerpt(path, task):
         write_npz(path, kept)
 
 
-OF_ONE_POLICY = ("opponents.json", "figures/opponents.png", "figures/dispersed.png")  # another's would look current
+def of_another_policy(folder) -> list[str]:
+    """What a folder holds of the policy that it ships, beside the three files: it would look current."""
+    return ["opponents.json", *(f"figures/{path.name}" for path in (folder / "figures").glob("*"))]
 
 
 def move(staged, folder, last, replaced):
@@ -122,7 +124,8 @@ def draw_figures(folder, arrays: dict, metrics: dict, curves: list[dict]) -> lis
 def animate(folder) -> Path:
     """Write figures/animation.gif of a results or run folder from its eval.json and eval.npz; returns its path."""
     folder = Path(folder)
-    return draw_animation(folder, *read_evaluation(folder)[::-1])
+    metrics, arrays = read_evaluation(folder)
+    return draw_animation(folder, arrays, metrics)
 
 
 def draw_animation(folder, arrays: dict, metrics: dict) -> Path:
@@ -177,7 +180,7 @@ def opponents_command(args):
     task.fly_opponents(
         args.folder,
         dispersion=args.dispersion,
-        n=args.starts,
+        n=args.starts or task.default_flights(trains=False, dispersion=args.dispersion),
         solved=args.solved,
         eval_seed=args.eval_seed,
         also=args.also,
@@ -216,7 +219,7 @@ def parse_args(argv=None):
     command.add_argument("folder", type=Path, help="results/<name> of a rocket with cut-off")
     command.add_argument("--dispersion", type=positive, default=1.0, metavar="K", help="default 1: envs.Dispersion")
     size = integer(10, 100_000)
-    command.add_argument("--starts", type=size, default=1705, metavar="N", help="flights, default 1705")
+    command.add_argument("--starts", type=size, metavar="N", help="flights (default: as many as an evaluation has)")
     command.add_argument(
         "--solved", type=size, default=200, metavar="N", help="the first of them, for IPOPT: default 200"
     )

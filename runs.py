@@ -124,6 +124,7 @@ def parse_args(kind, argv, env_options, buffers):
     if unfit := task.refusal(not args.eval_only, **options_of(args, env_options)):
         name, why = unfit
         refuse(name, "", why)
+    check_share(args, typed)
     if args.eval_only and saved and saved["progress"]["seed"] == args.eval_seed:
         if remark := task.remark_on_seed(args.eval_seed):
             print(remark)
@@ -186,7 +187,6 @@ def check(args, typed, env_ids):
         refuse("exp_name", args.exp_name, "must be the name of a folder, without /")
     if args.track and importlib.util.find_spec("wandb") is None:
         refuse("track", "", "needs wandb: pip install wandb")
-    check_share(args, typed)
 
 
 def check_outputs(args):

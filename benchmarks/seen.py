@@ -23,7 +23,7 @@ import torch
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from attention import load  # noqa: E402
 
-import envs  # noqa: E402
+from common.errors import BadInput  # noqa: E402
 from rocket.metrics import draws, element_misses, fly_dispersed  # noqa: E402
 
 SCRIPT = importlib.import_module("ppo_gtrxl_rocket")
@@ -33,17 +33,17 @@ NAMES = ("altitude", "climb", "out of plane", "its speed", "speed", "log mass", 
 
 def fly(agent, args, options, n):
     """n dispersed flights of the mean action: observed (T, n, obs), steps flown (n,), final misses by element (n,)."""
-    mission, seen = envs.ROCKETS[args.env_id], []
-    policy = agent.make_policy(gym.make_vec(args.env_id, num_envs=1, **options).episode_steps)
+    environment, seen = gym.make_vec(args.env_id, num_envs=1, **options), []
+    policy, rocket = agent.make_policy(environment.episode_steps), environment.rocket
 
     def recorded(obs, t):
         seen.append(obs.copy())
         return policy(obs, t)
 
-    z = draws(mission.rocket, args.dispersion, args.eval_seed, n)
+    z = draws(rocket, args.dispersion, args.eval_seed, n)
     ends = fly_dispersed(args.env_id, recorded, z, **options)
-    flown = np.ceil(ends["final_t"] / mission.rocket.dt - 1e-9).astype(int)
-    return torch.tensor(np.stack(seen), dtype=torch.float32), flown, element_misses(ends, mission.rocket)
+    flown = np.ceil(ends["final_t"] / rocket.dt - 1e-9).astype(int)
+    return torch.tensor(np.stack(seen), dtype=torch.float32), flown, element_misses(ends, rocket)
 
 
 def explained(inputs, y):
@@ -59,13 +59,13 @@ def main():
     path = parser.parse_args().checkpoint
     try:
         agent, args, options = load(path)
-    except envs.BadInput as error:
+    except BadInput as error:
         sys.exit(str(error))
     if not args.dispersion:
         sys.exit(f"checkpoint {path}: its dispersion is 0; it must be of a rocket trained with --dispersion")
     obs, flown, misses = fly(agent, args, options, FLIGHTS)
     misses = {key.rsplit("_", 1)[0]: miss for key, miss in misses.items() if key != "apogee_km"}
-    dt, last = envs.ROCKETS[args.env_id].rocket.dt, int(flown.min())
+    dt, last = gym.make(args.env_id).unwrapped.batch.dt, int(flown.min())
     late = [last - round(seconds / dt) for seconds in (40, 10)]
     print("standard deviations of the differences, in their sizes:", ", ".join(NAMES))
     print("and R squared of the final misses, by the differences / by their tanh:", ", ".join(misses))

@@ -25,7 +25,10 @@ class BatchedEnv(VectorEnv):
     `final_info` arrays of the finished episodes; it is only called when there is one. One that can be rendered has
     `RENDERED` in its `metadata` and two more: `_snapshot()` returns time (N,) s, the control of the step before (N, m)
     and state (N, n), arrays of their own; `_make_sheet()` returns the drawing, whose `frame(t, u, y)` is a flight's
-    picture. `dt` is the step in s, `phase` (N,) the 0-based phase in which the running steps begin.
+    picture.
+
+    Every problem has two more attributes: `dt`, the step in s, and `phase` (N,), the 0-based phase in which the running
+    steps begin.
 
     With the attribute `flights_per_start` G, to be set before a `reset` and only in training, environment k flies start
     k // G, so that flights differ by their actions alone (1: each flies its own start; the last group is smaller where

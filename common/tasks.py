@@ -3,7 +3,8 @@
 A *family* is a kind of environment with tables of its own: the small problems (`phased/`), the rockets (`rocket/`).
 `evaluate.py`, `runs.py`, the command of `baselines.py` and the benchmarks call `task_of(env_id)` and never ask which
 family it is. A new family is a folder with a class of this shape, and one line `add_family(TABLES, make_task)` in
-`envs.py`. The small problems' line is in `baselines.py`, which solves them: their ids are known once that is imported.
+`envs.py`. The small problems' line is in `baselines.py`, which solves them: their ids are known once that is imported,
+as `evaluate.py` does.
 """
 
 from __future__ import annotations
@@ -33,9 +34,9 @@ class Task(Protocol):
         ...
 
     def optimum(self, eval_seed: int, n: int, **env_options) -> dict:
-        """The optimum of the n evaluated flights of a seed, as the environment flies it; a process solves it once.
+        """The optimum of the n evaluated flights of a seed, as the environment flies it.
 
-        Raises NoOptimum where a solve fails.
+        What was asked for lately is remembered. Raises NoOptimum where a solve fails.
         """
         ...
 
@@ -70,7 +71,7 @@ class Task(Protocol):
         ...
 
     def refusal(self, trains: bool, **env_options) -> tuple[str, str] | None:
-        """A field of a script's Args that does not fit these options, and why; None where all fit."""
+        """A flag (`no_observe_phase`) that does not fit these options, and why; None where all fit."""
         ...
 
     # --- words and pictures
@@ -133,7 +134,8 @@ FAMILIES: list[tuple[Mapping[str, Any], Callable[[str], Task]]] = []
 
 
 def add_family(tables: Mapping[str, Any], make_task: Callable[[str], Task]) -> None:
-    """Make a family's ids known. `tables` is kept: an id that is added to it later is known, too."""
+    """Make a family's ids known, or known anew. `tables` is kept: an id that is added to it later is known, too."""
+    FAMILIES[:] = [family for family in FAMILIES if family[0] is not tables]
     FAMILIES.append((tables, make_task))
 
 
@@ -147,4 +149,4 @@ def task_of(env_id: str) -> Task:
     for tables, make_task in FAMILIES:
         if env_id in tables:
             return make_task(env_id)
-    raise BadInput(f"env_id is {env_id!r}; it must be one of {', '.join(env_ids())}")
+    raise BadInput(f"env_id is {env_id!r}, of no family (`add_family`); it must be one of {', '.join(env_ids())}")

@@ -10,9 +10,9 @@ from PIL import Image
 
 from common.files import replacing
 
-# policy red, optimum blue, target green, as in the paper. Time is in s; x, u, J have no unit
 SHOWN = 10  # the paper shows ten starts
-# the optimum is drawn last and dashed: both lines are seen where they coincide, also without telling red from blue
+# policy red, optimum blue, target green, as in the paper. Time is in s; x, u, J have no unit
+# the optimum is plotted last and dashed: both lines are seen where they coincide, also without telling red from blue
 POLICY = {"color": "tab:red", "linewidth": 1.6, "linestyle": "-"}
 OPTIMUM = {"color": "tab:blue", "linewidth": 1.0, "linestyle": (0, (4, 2))}
 TARGET = {"color": "tab:green", "linewidth": 1.5}

@@ -159,9 +159,8 @@ class PhasedVectorEnv(BatchedEnv):
         return self.t * self.problem.dt, self.u[:, None], np.column_stack(self.x)
 
     def _make_sheet(self):
-        from phased.animation import (
-            PhasePlane,  # Matplotlib takes a quarter of a second that only a picture should cost
-        )
+        # Matplotlib takes a quarter of a second that only a picture should cost
+        from phased.animation import PhasePlane
 
         return PhasePlane(self.problem)
 

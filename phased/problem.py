@@ -8,6 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 
+def lists_to_tuples(table):
+    """Make lists and arrays of a table tuples: equal tables are then one key of what is solved once."""
+    for name, value in vars(table).items():
+        if isinstance(value, list | np.ndarray):
+            object.__setattr__(table, name, tuple(value))
+
+
 @dataclass(frozen=True)
 class Phase:
     """One column of a parameter table. Matrices are diagonal: Q = diag(Q), Q_f = Qf I_2 (printed for one column)."""
@@ -19,6 +26,9 @@ class Phase:
     Qf: float  # terminal cost
     bonus: float  # terminal bonus B
     Q: tuple[float, float] = (1.0, 1.0)  # state cost
+
+    def __post_init__(self):
+        lists_to_tuples(self)
 
 
 @dataclass(frozen=True)
@@ -37,6 +47,9 @@ class Problem:
     dt: float = 0.1  # s
     x0_max: float = 1.0  # the table's "state bounds", by our reading the box of the initial states, never a constraint
     single_optimum: bool = False
+
+    def __post_init__(self):
+        lists_to_tuples(self)
 
     @property
     def steps(self) -> int:

@@ -21,16 +21,13 @@ KEPT_STARTS = 100  # in a results folder
 class PhasedTask:
     """A problem in `PROBLEMS`, measured over starts in its box."""
 
+    env_id: str
     problem: Problem
-    solve: Callable  # (problem, eval_seed, n) -> the optimum's flights from the n starts of a seed
-    report: Callable  # (problem, starts, seed) -> the numbers and arrays of the printed optimum
-
-    @property
-    def env_id(self) -> str:
-        return self.problem.env_id
+    solve: Callable  # (env_id, problem, eval_seed, n) -> the optimum's flights from the n starts of a seed
+    report: Callable  # (env_id, starts, seed) -> the numbers and arrays of the printed optimum
 
     def optimum(self, eval_seed: int, n: int, **env_options) -> dict:
-        return self.solve(self.problem, eval_seed, n)
+        return self.solve(self.env_id, self.problem, eval_seed, n)
 
     # --- flying and measuring
 
@@ -143,7 +140,7 @@ class PhasedTask:
         parser.add_argument("--seed", type=integer(0, 2**32 - 1), default=0, metavar="S", help="default 0")
 
     def baseline_command(self, args) -> tuple[dict, dict]:
-        return self.report(self.problem, args.starts, args.seed)
+        return self.report(self.env_id, args.starts, args.seed)
 
     def fly_opponents(self, folder, **options) -> None:
         raise BadInput(f"the env_id of {folder} is {self.env_id}; it must be a rocket's with cut-off")

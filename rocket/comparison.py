@@ -211,7 +211,7 @@ def table(report: dict) -> str:
     for name, *others in rows:
         lines.append(f"  {name:<{width}}" + "".join(f"  {cell:>{w}}" for cell, w in zip(others, WIDTHS)))
     lines.append("  Shares: mean mass over that of the optimum that knows the draw, to the target and to the orbit")
-    flights = f"of {known} flights; of fewer (in brackets) where a law missed the orbit."
+    flights = f"of {known} flights; of fewer (in brackets) where one missed the orbit."
     lines.append(f"    that was reached, {flights}")
     if "bound_mass_mean_kg" in report:
         lines[-1] += f" To the target it leaves {report['bound_mass_mean_kg']:.2f} kg on average."
@@ -281,7 +281,7 @@ def compare(env_id: str, folder: Path, dispersion: float, n: int, solved: int, e
     checkpoints = {"policy": folder / "agent.safetensors"}
     for name, path in also:
         is_new = name not in {*checkpoints, *KNOWLEDGE}
-        refuse_unless(is_new, "the NAME of --also", name, "must be that of no other law")
+        refuse_unless(is_new, "the NAME of --also", name, "must be that of no other row")
         checkpoints[name] = path
     check(env_id, folder, n, solved, checkpoints)
     comparison = Comparison(env_id, dispersion, eval_seed, n, solved)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -99,8 +99,8 @@ class RocketVectorEnv(BatchedEnv):
     the last burn's end.
 
     Reward: the sum of the five parts R_orbital, R_trajectory, R_guidance, R_penalties and R_terminal, each a function
-    of `rocket.py`. `final_info`, (N,) each: `error_norm` (and `error` (N, 6), the terminal error in ECI), `a_km e i_deg
-    raan_deg argp_deg final_mass_kg final_time_s max_altitude_km` (at the steps' ends), the parts' sums,
+    of `rewards.py`. `final_info`, (N,) each: `error_norm` (and `error` (N, 6), the terminal error in ECI), `a_km e
+    i_deg raan_deg argp_deg final_mass_kg final_time_s max_altitude_km` (at the steps' ends), the parts' sums,
     `episodic_return`, `points` (`precision_points`), `crashed`; with dispersion `draw` (N, k) and `dry`, out of fuel.
 
     Attributes for training alone, to be set before a `reset`: `guidance` (a key of `REFERENCE_PITCH`),
@@ -341,10 +341,10 @@ class RocketVectorEnv(BatchedEnv):
         return rewards, done, self._final_info
 
     def _fly(self, y, steps, duration):
-        """States (7, n) `duration` (n,) s after the begin of these steps, whose states y (7, n) were then.
+        """States (7, n) `duration` (n,) s after the begin of these steps. y (7, n): the states at the begin.
 
-        From event to event: a round flies everyone to the next event or to the end of the duration, then those whom the
-        event has met go on in the arc behind it.
+        Each round flies from one event to the next, or to the end of the duration. Those that met an event then drop
+        what is dropped, and go on in the next arc.
         """
         flown, flying = None, None  # (7, n), and its columns that are still flying: at first all
         while True:
@@ -466,9 +466,8 @@ class RocketVectorEnv(BatchedEnv):
         return self.time.copy(), self.u.T.copy(), self.y.T.copy()
 
     def _make_sheet(self):
-        from rocket.animation import (
-            AscentSheet,  # Matplotlib takes a quarter of a second that only a picture should cost
-        )
+        # Matplotlib takes a quarter of a second that only a picture should cost
+        from rocket.animation import AscentSheet
 
         title = "Rocket ascent, nominal stagings marked" if self.dispersion else "Rocket ascent"
         return AscentSheet(self.rocket, title)
@@ -558,6 +557,8 @@ def register_rocket(env_id: str, rocket: Rocket, cutoff: bool = False, ceiling_k
     others = gym.registry.keys() - ROCKETS.keys()
     if env_id in others or not ENV_ID_RE.fullmatch(env_id) or "/" in env_id:
         raise BadInput(f"env_id is {env_id!r}; it must be a new id such as MyRocket-v0")
+    for name in rules.keys() - {field.name for field in fields(Mission)}:
+        raise BadInput(f"a keyword is {name!r}; it must be a field of Mission (`late` is now `floor_from`)")
     mission = Mission(rocket, cutoff, ceiling_km, **rules)
     if ROCKETS.get(env_id, mission) != mission:
         warnings.warn(f"{env_id} was another rocket's id; from here on it is this one's", stacklevel=2)
@@ -565,8 +566,8 @@ def register_rocket(env_id: str, rocket: Rocket, cutoff: bool = False, ceiling_k
     try:
         gym.register(
             id=env_id,
-            entry_point="rocket.environment:make_rocket",
-            vector_entry_point="rocket.environment:make_rocket_vector",
+            entry_point="envs:make_rocket",
+            vector_entry_point="envs:make_rocket_vector",
             kwargs={"env_id": env_id},
         )
     except gym.error.Error as error:  # the name of another environment without its version

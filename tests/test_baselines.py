@@ -15,7 +15,7 @@ import baselines
 from baselines import box_qp, fly_solution, hermite_simpson, lqr, lqr_policy, optimise, reference
 from common import files
 from common.ipopt import interruptible
-from common.tasks import env_ids
+from common.tasks import env_ids, task_of
 from envs import DOUBLE_INTEGRATOR, PROBLEMS, VAN_DER_POL, Phase, Problem, double_integrator, fly
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -524,6 +524,16 @@ def test_command_of_a_problem_of_a_users_own(new_problem, capsys, phases):
     assert ("lqr_ratio_of_sums" if phases == 1 else "distance_phase_2") in printed
     x0 = np.random.default_rng(7).uniform(-2, 2, (3, 2))
     assert float(printed["cost_mean"]) == pytest.approx(reference(problem.env_id, x0)["cost"].mean(), rel=1e-6)
+
+
+def test_a_table_may_hold_lists_and_arrays(new_problem):
+    """Solved once, as a table of tuples is, under the id that it is registered by."""
+    column = Phase(steps=20, target=[0.5, 0.0], radius=0.1, R=0.1, Qf=20.0, bonus=20.0)
+    problem = Problem("Lists-v0", double_integrator, 5.0, [column], np.array([200.0, 90.0]))
+    task, optima = task_of(new_problem(problem)), []
+    for _ in range(2):
+        optima.append(task.optimum(3, 4))
+    assert optima[0] is optima[1] and optima[0]["x"].shape == (4, 21, 2)
 
 
 def test_every_id_and_every_short_name_is_a_command():

@@ -6,7 +6,12 @@ import sys
 from graphlib import TopologicalSorter
 from pathlib import Path
 
+import gymnasium as gym
 import pytest
+
+import baselines  # noqa: F401 - makes every id known
+from common import tasks
+from common.errors import BadInput
 
 ROOT = Path(__file__).parent.parent
 OUTSIDE = {"tests", "benchmarks", "docs"}  # they import the house; nothing in it imports them
@@ -112,6 +117,33 @@ def test_nothing_asks_which_family_an_id_is_of():
     families = {"PROBLEMS": ("phased", "envs", "baselines", "ppo_gtrxl"), "ROCKETS": ("rocket", "envs", "ppo_gtrxl")}
     for path in [*PATHS, *(ROOT / "benchmarks").glob("*.py")]:
         head = path.relative_to(ROOT).parts[0].removesuffix(".py")
-        names = {node.id for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Name)}
+        nodes = list(ast.walk(ast.parse(path.read_text())))
+        names = {node.id for node in nodes if isinstance(node, ast.Name)}
+        names |= {node.attr for node in nodes if isinstance(node, ast.Attribute)}
         for table, readers in families.items():
             assert table not in names or head.startswith(readers), (path, table)
+
+
+def test_a_family_that_is_added_again_replaces_itself(monkeypatch):
+    """As when `baselines.py` is both the command and imported by a file of `vehicles/`."""
+    before = list(tasks.FAMILIES)
+    monkeypatch.setattr(tasks, "FAMILIES", before)
+    tables = before[0][0]
+    tasks.add_family(tables, lambda env_id: f"the new task of {env_id}")
+    assert len(tasks.FAMILIES) == len(before) and len(set(tasks.env_ids())) == len(tasks.env_ids())
+    assert tasks.task_of(next(iter(tables))).startswith("the new task")
+
+
+def test_an_id_without_a_task_is_one_line():
+    with pytest.raises(BadInput, match="^env_id is 'CartPole-v1', of no family .* one of [^\\n]*VanDerPol-v0"):
+        tasks.task_of("CartPole-v1")
+
+
+@pytest.mark.parametrize("env_id", ["VanDerPol-v0", "TwoStageLEO-v0"])
+def test_a_process_that_knows_only_the_spec_makes_the_environment(env_id):
+    """As a worker that is spawned by Gymnasium's AsyncVectorEnv, which imports nothing of ours."""
+    spec = gym.spec(env_id).to_json()
+    code = f"import gymnasium as gym\nspec = gym.envs.registration.EnvSpec.from_json({spec!r})\n"
+    code += "print(gym.make(spec).reset(seed=0)[0].shape)"
+    result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert result.returncode == 0 and result.stdout.startswith("("), result.stderr

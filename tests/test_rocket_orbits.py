@@ -1,4 +1,4 @@
-"""Orbits in rocket.py against CSPICE's conics and closed forms: elements, targets of every shape, terminal error."""
+"""rocket/orbits.py against CSPICE's conics and closed forms: elements, targets of every shape, terminal error."""
 
 import math
 import warnings
