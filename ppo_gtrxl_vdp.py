@@ -32,7 +32,7 @@ class Args:
     seed: int = 1  # seed of the experiment
     torch_deterministic: bool = True  # if toggled, `torch.backends.cudnn.deterministic=True`
     cuda: bool = True  # if toggled, a GPU is used when there is one
-    num_threads: int = 0  # CPU threads of torch (0: torch's own choice)
+    num_threads: int = 1  # CPU threads of torch (0: torch's own choice); bits depend on it
     torch_compile: bool = False  # compile the network: a minute or more at the start, quicker updates after it
     track: bool = False  # if toggled, this experiment will be tracked with Weights and Biases
     wandb_project_name: str = "ppo-gtrxl"  # the wandb's project name
@@ -129,7 +129,7 @@ def set_curriculum(envs, args, progress, refines, std):
     envs.flights_per_start = args.flights_per_start if refines else 1
     shrinks_until = 0.6 if args.refine_from is None else args.refine_from
     left = max(0.0, 1 - progress / shrinks_until) if shrinks_until else 0.0
-    if len(envs.problem.phases) > 1:
+    if envs.problem.waypoints:
         envs.radius_scale = 0.9 if refines else args.radius_curriculum**left
         envs.bonus_width = 0.4 if refines else 0.0
     return envs.flights_per_start
@@ -172,8 +172,13 @@ class RelativeAttention(nn.Module):
 
     def __init__(self, embed_dim, num_heads, memory_length):
         super().__init__()
-        self.num_heads, self.memory_length, self.dk = num_heads, memory_length, embed_dim // num_heads
-        self.query, self.key, self.value, self.out = (linear(embed_dim, embed_dim, bias=None) for _ in range(4))
+        self.num_heads = num_heads
+        self.memory_length = memory_length
+        self.dk = embed_dim // num_heads
+        self.query = linear(embed_dim, embed_dim, bias=None)  # W^Q
+        self.key = linear(embed_dim, embed_dim, bias=None)  # W^K
+        self.value = linear(embed_dim, embed_dim, bias=None)  # W^V
+        self.out = linear(embed_dim, embed_dim, bias=None)
         self.R = nn.Parameter(torch.zeros(num_heads, memory_length + 1, self.dk))
 
     def forward(self, x, memory):
@@ -181,17 +186,21 @@ class RelativeAttention(nn.Module):
 
         Queries in chunks of C <= max(L / 2, 64) steps, each against its own window of L + C keys: linear in T.
         """
-        (N, T, d), L, H, dk = x.shape, self.memory_length, self.num_heads, self.dk
+        N, T, d = x.shape
+        L, H, dk = self.memory_length, self.num_heads, self.dk
         chunks = math.ceil(T / max(L // 2, 64))
         C = math.ceil(T / chunks)
         pad = (0, 0, 0, chunks * C - T)  # steps after the last, so that every chunk has C
         context = torch.cat([memory, x], dim=1)  # (N, L + T, d)
+
         q = F.pad(self.query(x) / math.sqrt(dk), pad)  # (N, chunks * C, d)
         q = q.view(N, chunks, C, H, dk).transpose(2, 3)  # (N, chunks, H, C, dk)
+
         k = F.pad(self.key(context), pad).unfold(1, L + C, C)  # (N, chunks, d, L + C), one window a chunk
         k = k.unflatten(2, (H, dk))  # (N, chunks, H, dk, L + C)
         v = F.pad(self.value(context), pad).unfold(1, L + C, C)
         v = v.unflatten(2, (H, dk))
+
         scores = q @ k + self.position_scores(q)  # (N, chunks, H, C, L + C)
         attended = scores.softmax(dim=-1) @ v.transpose(-1, -2)  # (N, chunks, H, C, dk)
         attended = attended.transpose(2, 3).reshape(N, chunks * C, d)
@@ -213,21 +222,28 @@ class RelativeAttention(nn.Module):
         return line[..., : C * (L + C)].unflatten(-1, (C, L + C))
 
     def start_cache(self, memory, steps):
-        """Keys and values of the memory (N, L, d) with room for `steps` more, (2, N, H, L + steps, dk); and what every
-        step uses: the three projections as one (3 d, d), and R in the order of the window's keys (H, L + 1, dk)."""
-        kv = torch.stack([self.key(memory), self.value(memory)]).unflatten(-1, (self.num_heads, self.dk))
-        kv = F.pad(kv.transpose(2, 3), (0, 0, 0, steps))
+        """What `step` needs: keys and values of the memory (N, L, d), with room for `steps` more; projections; R.
+
+        Keys and values are (2, N, H, L + steps, dk), the three projections one matrix (3 d, d), and R is in the order
+        of the window's keys, (H, L + 1, dk).
+        """
+        kv = torch.stack([self.key(memory), self.value(memory)])  # (2, N, L, d)
+        kv = kv.unflatten(-1, (self.num_heads, self.dk)).transpose(2, 3)  # (2, N, H, L, dk)
+        kv = F.pad(kv, (0, 0, 0, steps))
         projections = torch.cat([self.query.weight / math.sqrt(self.dk), self.key.weight, self.value.weight])
         return kv, projections, self.R.flip(1)
 
     def step(self, x, cache, t):
         """Step t alone: x (N, d) -> (N, d); writes its key and value into the cache, reads the window before it."""
-        (kv, projections, R), L = cache, self.memory_length
-        qkv = F.linear(x, projections).view(len(x), 3, self.num_heads, 1, self.dk).transpose(0, 1)  # (3, N, H, 1, dk)
+        kv, projections, R = cache
+        L = self.memory_length
+        qkv = F.linear(x, projections)  # (N, 3 d)
+        qkv = qkv.view(len(x), 3, self.num_heads, 1, self.dk).transpose(0, 1)  # (3, N, H, 1, dk)
         kv[:, :, :, t + L : t + L + 1] = qkv[1:]
         k, v = kv[:, :, :, t : t + L + 1]  # (N, H, L + 1, dk)
         scores = qkv[0] @ (k + R).transpose(-1, -2)  # (N, H, 1, L + 1)
-        return self.out((scores.softmax(dim=-1) @ v).flatten(1))
+        attended = scores.softmax(dim=-1) @ v  # (N, H, 1, dk)
+        return self.out(attended.flatten(1))
 
 
 class GTrXLBlock(nn.Module):
@@ -236,8 +252,10 @@ class GTrXLBlock(nn.Module):
     def __init__(self, embed_dim, num_heads, memory_length, mlp_dim):
         super().__init__()
         self.attention = RelativeAttention(embed_dim, num_heads, memory_length)
-        self.norm1, self.norm2 = nn.LayerNorm(embed_dim), nn.LayerNorm(embed_dim)
-        self.gate1, self.gate2 = Gate(embed_dim), Gate(embed_dim)
+        self.norm1 = nn.LayerNorm(embed_dim)
+        self.norm2 = nn.LayerNorm(embed_dim)
+        self.gate1 = Gate(embed_dim)
+        self.gate2 = Gate(embed_dim)
         self.mlp = nn.Sequential(linear(embed_dim, mlp_dim), nn.GELU(), linear(mlp_dim, embed_dim))
 
     def forward(self, x, attended):
@@ -255,14 +273,22 @@ class Agent(nn.Module):
 
     def __init__(self, args, envs):
         super().__init__()
-        d, hidden, actions = args.embed_dim, args.hidden_dim, envs.single_action_space.shape[0]
-        self.num_blocks, self.memory_length, self.embed_dim = args.num_blocks, args.memory_length, d
-        for name, value in {**BUFFERS[args.env_id], "action_scale": envs.single_action_space.high.tolist()}.items():
+        d, hidden = args.embed_dim, args.hidden_dim
+        actions = envs.single_action_space.shape[0]
+        self.num_blocks = args.num_blocks
+        self.memory_length = args.memory_length
+        self.embed_dim = d
+
+        # constants of the problem, saved with the weights; `features` and `mean_action` read them as agent.<name>
+        constants = {**BUFFERS[args.env_id], "action_scale": envs.single_action_space.high.tolist()}
+        for name, value in constants.items():
             self.register_buffer(name, torch.tensor(value))
-        inputs = len(features(self, torch.ones(envs.single_observation_space.shape)))  # zeros have no direction
+        any_observation = torch.ones(envs.single_observation_space.shape)  # zeros have no direction
+        inputs = len(features(self, any_observation))
+
         self.encoder = nn.Sequential(linear(inputs, d, gain=2**0.5), nn.GELU())
-        sizes = d, args.num_heads, args.memory_length, args.mlp_dim
-        self.blocks = nn.ModuleList(GTrXLBlock(*sizes) for _ in range(args.num_blocks))
+        blocks = [GTrXLBlock(d, args.num_heads, args.memory_length, args.mlp_dim) for _ in range(args.num_blocks)]
+        self.blocks = nn.ModuleList(blocks)
         self.actor = nn.Sequential(linear(d, hidden, gain=2**0.5), nn.GELU(), linear(hidden, actions, gain=0.01))
         self.actor[-1].bias.data = torch.tensor(INITIAL_ACTION)
         self.critic = nn.Sequential(linear(d, hidden, gain=2**0.5), nn.GELU(), linear(hidden, 1))
@@ -299,22 +325,27 @@ class Agent(nn.Module):
     def get_policy(self, hidden):
         """The Gaussian that training samples from, of hidden (..., d): over actions (..., actions), in their unit."""
         mean = self.get_mean_action(hidden)
-        return Normal(mean, self.actor_logstd.clamp(*LOG_STD_RANGE).exp().expand_as(mean), validate_args=False)
+        std = self.actor_logstd.clamp(*LOG_STD_RANGE).exp()
+        return Normal(mean, std.expand_as(mean), validate_args=False)
 
     def evaluate_actions(self, hidden, actions):
         """log pi(a|s), the policy's entropy and the critic's output, (...) each, of hidden (..., d), (..., actions)."""
         probs = self.get_policy(hidden)
-        return probs.log_prob(actions).sum(-1), probs.entropy().sum(-1), self.critic(hidden).squeeze(-1)
+        logprob = probs.log_prob(actions).sum(-1)
+        entropy = probs.entropy().sum(-1)
+        value = self.critic(hidden).squeeze(-1)
+        return logprob, entropy, value
 
     def make_policy(self, steps):
         """What evaluation flies: obs (N, obs), t -> mean actions (N, actions), in NumPy; its memory begins as zeros."""
-        like, cache = self.actor_logstd, []
+        dtype, device = self.actor_logstd.dtype, self.actor_logstd.device
+        cache = []
 
         @torch.no_grad()
         def policy(obs, t):
             if t == 0:
                 cache[:] = self.start_cache(self.new_memory(len(obs), noise=0.0), steps)
-            hidden = self.encode_step(torch.as_tensor(obs, dtype=like.dtype, device=like.device), cache, t)
+            hidden = self.encode_step(torch.as_tensor(obs, dtype=dtype, device=device), cache, t)
             return self.get_mean_action(hidden).cpu().numpy()
 
         return policy
@@ -339,14 +370,27 @@ class Batch:
 @torch.no_grad()
 def rollout(agent, envs, reward_scale, memory_noise):
     """One episode in each environment (Algorithm 1, lines 3-13): the Batch and all processes' `final_info`."""
-    T, N, like = envs.episode_steps, envs.num_envs, agent.actor_logstd
-    shapes = envs.single_observation_space.shape, envs.single_action_space.shape, (), (), (), ()
-    batch = Batch(*(like.new_zeros(T, N, *shape) for shape in shapes), agent.new_memory(N, memory_noise))  # line 5
-    cache, hidden = agent.start_cache(batch.memory, T), like.new_zeros(T, N, agent.embed_dim)
-    alive, episodes, (next_obs, _) = np.ones(N, dtype=bool), {}, envs.reset()
+    T, N = envs.episode_steps, envs.num_envs
+    zeros = agent.actor_logstd.new_zeros  # on the agent's device, in its precision
+    batch = Batch(
+        obs=zeros(T, N, *envs.single_observation_space.shape),
+        actions=zeros(T, N, *envs.single_action_space.shape),
+        logprobs=zeros(T, N),
+        rewards=zeros(T, N),
+        values=zeros(T, N),
+        alive=zeros(T, N),
+        memory=agent.new_memory(N, memory_noise),  # line 5
+    )
+    cache = agent.start_cache(batch.memory, T)
+    hidden = zeros(T, N, agent.embed_dim)
+    alive = np.ones(N, dtype=bool)
+    episodes = {}  # `final_info` of each environment's first episode
+    next_obs, _ = envs.reset()
     batch.obs[:] = torch.as_tensor(next_obs)  # steps that nobody lives to are computed, too: they need a real state
+
     for t in range(T):  # line 6
-        batch.obs[t], batch.alive[t] = torch.as_tensor(next_obs), torch.as_tensor(alive)
+        batch.obs[t] = torch.as_tensor(next_obs)
+        batch.alive[t] = torch.as_tensor(alive)
         hidden[t] = agent.encode_step(batch.obs[t], cache, t)  # lines 7 and 10: of states, not of actions
         batch.actions[t] = agent.get_policy(hidden[t]).sample()  # line 8
         next_obs, reward, terminated, _, info = envs.step(batch.actions[t].cpu().numpy())  # line 9
@@ -358,20 +402,24 @@ def rollout(agent, envs, reward_scale, memory_noise):
         alive = alive & ~terminated  # an ended environment has started anew; only its first episode counts
         if not alive.any():
             break
+
     batch.logprobs, _, batch.values = agent.evaluate_actions(hidden, batch.actions)  # v_t of line 8
-    everyone = runs.all_gather(episodes)
-    return batch, {key: np.concatenate([part[key] for part in everyone]) for key in episodes}
+    of_each_process = runs.all_gather(episodes)
+    return batch, {key: np.concatenate([part[key] for part in of_each_process]) for key in episodes}
 
 
 def gae(rewards, values, alive, gamma, gae_lambda):
     """A_t = sum_l (gamma lambda)^l delta_{t+l} and the returns A + V, all (T, N); V is 0 beyond an episode's end."""
-    advantages, lastgaelam = torch.zeros_like(rewards), 0.0
-    next_value, next_alive = torch.zeros_like(values[0]), torch.zeros_like(alive[0])
+    advantages = torch.zeros_like(rewards)
+    lastgaelam = 0.0
+    next_value = torch.zeros_like(values[0])
+    next_alive = torch.zeros_like(alive[0])
     for t in reversed(range(len(rewards))):
         delta = rewards[t] + gamma * next_value * next_alive - values[t]
         lastgaelam = (delta + gamma * gae_lambda * next_alive * lastgaelam) * alive[t]
         advantages[t] = lastgaelam
-        next_value, next_alive = values[t], alive[t]
+        next_value = values[t]
+        next_alive = alive[t]
     return advantages, advantages + values
 
 
@@ -390,14 +438,16 @@ def linear_fit(x, y, alive):
     with the leverage l a function of the states at this step alone, not of the action: a state's gradient keeps its
     direction, extreme states count less. (A fit without it was worse: docs/training-notes.md.)
     """
-    weight, count = alive.double()[..., None], alive.double().sum(-1)[..., None, None].clamp(min=1)
     x, y = x.double(), y.double()[..., None]
+    weight = alive.double()[..., None]  # (..., G, 1)
+    count = weight.sum(-2, keepdim=True).clamp(min=1)  # (..., 1, 1)
     y_mean = (y * weight).sum(-2, keepdim=True) / count
-    x = (x - (x * weight).sum(-2, keepdim=True) / count) * weight
-    x = x / ((x * x).sum(-2, keepdim=True) / count).sqrt().add(1e-6)
+    x = (x - (x * weight).sum(-2, keepdim=True) / count) * weight  # centred
+    x = x / ((x * x).sum(-2, keepdim=True) / count).sqrt().add(1e-6)  # of unit spread
     ridge = 0.01 * count * torch.eye(x.shape[-1]).to(x)  # what all episodes share has no slope
     slope = torch.linalg.solve(x.mT @ x + ridge, x.mT @ (y - y_mean))
-    return (y_mean + x @ slope)[..., 0].to(alive.dtype)
+    fitted = y_mean + x @ slope  # (..., G, 1)
+    return fitted[..., 0].to(alive.dtype)
 
 
 def returns_baseline(batch, gamma, group):
@@ -409,11 +459,12 @@ def returns_baseline(batch, gamma, group):
     """
     if group == 1:
         return torch.zeros_like(batch.rewards), torch.ones_like(batch.rewards[:, :1])
-    returns, _ = gae(batch.rewards, torch.zeros_like(batch.values), batch.alive, gamma, 1.0)  # Monte-Carlo
-    obs, returns, alive = (x.unflatten(1, (-1, group)) for x in (batch.obs, returns, batch.alive))
-    baseline = linear_fit(obs, returns, alive).flatten(1)
-    _, variance = moments(returns.flatten(1) - baseline, batch.alive, 1)
-    floor = 0.3 * variance.sqrt().mean()  # some steps have next to no spread (those after every end count, as 0)
+    no_values = torch.zeros_like(batch.values)
+    returns, _ = gae(batch.rewards, no_values, batch.alive, gamma, 1.0)  # Monte-Carlo
+    obs, grouped_returns, alive = (x.unflatten(1, (-1, group)) for x in (batch.obs, returns, batch.alive))
+    baseline = linear_fit(obs, grouped_returns, alive).flatten(1)
+    _, variance = moments(returns - baseline, batch.alive, 1)
+    floor = 0.3 * variance.sqrt().mean()  # some steps have next to no spread; those after every end count, with none
     return baseline, (variance + floor**2 + 1e-8).sqrt()
 
 
@@ -430,23 +481,35 @@ def ppo_loss(agent, batch, mb, clip_coef, vf_coef, ent_coef):
     The paper's sum with the sign that raises L_CLIP, and L_VF = 1/2 (V - R)^2. Under torchrun the loss is this
     process's part of the mean (the gradients are then summed), what is logged is of all.
     """
-    alive, advantages = batch.alive[:, mb], batch.advantages[:, mb]
+    alive = batch.alive[:, mb]
+    advantages = batch.advantages[:, mb]
     steps = all_reduce_sum(alive.sum())
-    mean = lambda x: (x * alive).sum() / steps  # noqa: E731
+
+    def mean(x):
+        return (x * alive).sum() / steps
+
     hidden = agent.encode(batch.obs[:, mb].transpose(0, 1), batch.memory[:, mb]).transpose(0, 1)  # line 17
     newlogprob, entropy, newvalue = agent.evaluate_actions(hidden, batch.actions[:, mb])
     logratio = (newlogprob - batch.logprobs[:, mb]) * alive  # beyond an episode's end it could overflow
     ratio = logratio.exp()
+
+    # policy loss, -L_CLIP
     clipped = torch.clamp(ratio, 1 - clip_coef, 1 + clip_coef)
     pg_loss = mean(torch.max(-advantages * ratio, -advantages * clipped))
+
+    # value loss, L_VF
     v_loss = mean(0.5 * (newvalue - batch.returns[:, mb]) ** 2)
+
     entropy_loss = mean(entropy)
     loss = pg_loss - ent_coef * entropy_loss + vf_coef * v_loss
+
     losses = {"policy_loss": pg_loss, "value_loss": v_loss, "entropy": entropy_loss, "total_loss": loss}
     with torch.no_grad():  # http://joschu.net/blog/kl-approx.html
-        losses |= {"old_approx_kl": mean(-logratio), "approx_kl": mean((ratio - 1) - logratio)}
+        losses["old_approx_kl"] = mean(-logratio)
+        losses["approx_kl"] = mean((ratio - 1) - logratio)
         losses["clipfrac"] = mean(((ratio - 1.0).abs() > clip_coef).to(ratio.dtype))
-    return loss, dict(zip(losses, all_reduce_sum(torch.stack([value.detach() for value in losses.values()]))))
+    of_all_processes = all_reduce_sum(torch.stack([value.detach() for value in losses.values()]))
+    return loss, dict(zip(losses, of_all_processes))
 
 
 # Shared: training (Algorithm 1) and main ------------------------------------------------------------------------------
@@ -471,11 +534,11 @@ def train(args, agent, average, optimizer, envs, run):
     """
     last = max(args.total_updates - 1, 1)
     target_kl = math.inf if args.target_kl is None else args.target_kl
-    refine_at = math.inf if args.refine_from is None else 1 + math.ceil(args.refine_from * last - 1e-9)
+    refine_from = math.inf if args.refine_from is None else args.refine_from
     for iteration in range(run.updates_done + 1, args.total_updates + 1):  # line 2
         progress = (iteration - 1) / last
-        refines = iteration >= refine_at
-        if iteration == refine_at:
+        refines = progress >= refine_from
+        if refines and (iteration - 2) / last < refine_from:  # the first update that does
             begin_refinement(agent, args)
         agent.actor_logstd.requires_grad_(args.noise == "learned" and not refines)
         std = agent.actor_logstd.exp().mean().item()
@@ -501,6 +564,7 @@ def train(args, agent, average, optimizer, envs, run):
             mean, variance = moments(advantages, batch.alive, (0, 1))
             batch.advantages = (advantages - mean) / (variance.sqrt() + 1e-8)
 
+        # lines 15-18: epochs of minibatches
         log = []
         for epoch in range(1, args.update_epochs + 1):  # line 15
             order = torch.randperm(envs.num_envs, device=advantages.device)
@@ -518,6 +582,7 @@ def train(args, agent, average, optimizer, envs, run):
                 average.update_parameters(agent)
             if losses["approx_kl"] > target_kl:
                 break  # the minibatch that went too far has taken no step, and ends the update
+
         means = {name: torch.stack([logged[name] for logged in log]).mean().item() for name in losses}
         means["explained_variance"] = explained_variance(batch.values, batch.returns, batch.alive)
         means["baseline_explained_variance"] = explained_variance(baseline, returns, batch.alive)
@@ -541,7 +606,16 @@ def main(argv):
     runs.load_checkpoint(agent, args, saved)
     average = AveragedModel(agent, multi_avg_fn=get_ema_multi_avg_fn(args.weight_average))
     optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
-    run = runs.Run(args, saved, agent, average, optimizer, envs, env_options, describe)
+    run = runs.Run(
+        args=args,
+        saved=saved,
+        agent=agent,
+        average=average,
+        optimizer=optimizer,
+        envs=envs,
+        env_options=env_options,
+        describe=describe,
+    )
     if args.torch_compile:
         agent.encode, agent.encode_step = torch.compile(agent.encode), torch.compile(agent.encode_step)
     if not args.eval_only:
