@@ -89,7 +89,8 @@ def keep_excerpt(path, task):
 
 def of_another_policy(folder) -> list[str]:
     """What a folder holds of the policy that it ships, beside the three files: it would look current."""
-    return ["opponents.json", *(f"figures/{path.name}" for path in (folder / "figures").glob("*"))]
+    figures = [path for path in (folder / "figures").glob("*") if path.is_file()]
+    return ["opponents.json", *(f"figures/{path.name}" for path in figures)]
 
 
 def move(staged, folder, last, replaced):
