@@ -1,7 +1,7 @@
 """PPO with a Gated Transformer-XL on a four-phase rocket ascent, measured against the true optimum in the same run.
 
     python ppo_gtrxl_rocket.py --seed 1  # the paper's 961 s, as results/rocket_fixed
-    python ppo_gtrxl_rocket.py --seed 1 --env-id RocketAscentCutoff-v0  # free final time; its flags: README.md
+    python ppo_gtrxl_rocket.py --seed 1 --env-id RocketAscentCutoff-v0  # free end; flags: results/rocket_cutoff
     python ppo_gtrxl_rocket.py --eval-only --checkpoint results/rocket_fixed/agent.safetensors
 
 Top to bottom: arguments, problem, Gated Transformer-XL, agent, PPO, training, main. From the first
@@ -106,11 +106,15 @@ BUFFERS = {env_id: policy_constants(mission.rocket) for env_id, mission in ROCKE
 INITIAL_ACTION = [1.0, 0.0, 0.0]  # straight up (local frame): a randomly steered rocket never leaves the ground
 
 
-LENGTH, SPEED = 64, 8  # an Earth radius and its circular speed in units of 100 km and 1 km/s
+LENGTH = 64  # the Earth's radius in 100 km, rounded
+SPEED = 8  # the circular speed there in km/s, rounded
 
 
 def motion(agent, obs):
-    """Position and velocity (..., 3) in the target's axes and units, and what flights are compared by (..., 7)."""
+    """Position and velocity (..., 3) each, and the seven quantities that flights are compared by (..., 7).
+
+    In the target orbit's axes, in Earth radii and circular speeds.
+    """
     r, v, mass = (obs[..., :7] / agent.units).split([3, 3, 1], dim=-1)
     r, v = r @ agent.axes.T, v @ agent.axes.T  # towards the perigee, along the semi-latus rectum, normal to the plane
     radius = r.norm(dim=-1, keepdim=True)
@@ -118,25 +122,28 @@ def motion(agent, obs):
     climb = SPEED * (r * v).sum(dim=-1, keepdim=True) / radius
     out_of_plane = LENGTH * r[..., 2:]
     out_of_plane_speed = SPEED * v[..., 2:]
-    speed = v.norm(dim=-1, keepdim=True)
+    speed = v.norm(dim=-1, keepdim=True)  # as it is, in circular speeds
     angle = torch.atan2(r[..., 1:2], r[..., :1])
     compared = [altitude, climb, out_of_plane, out_of_plane_speed, speed, mass.log(), angle]
     return r, v, torch.cat(compared, dim=-1)
 
 
 def features(agent, obs):
-    """What the encoder sees (..., inputs) of observations (..., 9 or more), in the target orbit's axes. In this order:
+    """What the encoder sees (..., inputs) of observations (..., 9 or more); every feature is ours. In this order:
 
-    - position r and velocity v; altitude, climb rate, out-of-plane position and speed, speed (`motion`)
+    - position r and velocity v in the target orbit's axes; altitude, climb rate, out-of-plane position and speed,
+      speed (`motion`)
     - the share of the time that is left, the logarithm of the mass, the phase one-hot
     - the orbit's error, [(h - h_T) / |h_T|, e - e_T] with h = r x v and e = v x h - r / |r| (mu = 1), and
-      tanh(10 error), in which small errors show: ours
+      tanh(10 error), in which small errors show
     - the draw, with --observe-draw
-    - the difference from the mean flight at this step, in units of `differences`, clipped at 10: ours. Where the
-      perigee will be is a sum of such differences, which tanh would flatten.
+    - `motion`'s seven quantities less the mean flight's at this step, in units of `differences`, clipped at 10 (a sum
+      of such differences tells where the perigee will be; tanh would flatten them)
+
+    The paper's observation, and ours, is r and v in ECI, m, t_norm and the phase.
     """
     r, v, compared = motion(agent, obs)
-    five, log_mass = compared[..., :5], compared[..., 5:6]
+    altitude_to_speed, log_mass = compared[..., :5], compared[..., 5:6]
     time_left, phase, draw = obs[..., 7:8], obs[..., 8:9], obs[..., 9:]
     one_hot = ((phase - agent.phases).abs() < 1e-3).to(obs.dtype)  # phase: 0 to 1 (the paper's 0 to 3)
 
@@ -146,34 +153,34 @@ def features(agent, obs):
 
     step = ((1 - time_left[..., 0]) * agent.steps).round().long()
     mean = agent.mean_flight[step.clamp(max=len(agent.mean_flight) - 1)]
-    has_flown = mean.any(dim=-1, keepdim=True)  # rows of zeros: no flight has come so far yet
+    has_flown = mean.any(dim=-1, keepdim=True)  # zeros: no mean yet, too few flights lived to this step
     differs = has_flown * ((compared - mean) / agent.differences).clamp(-10, 10)
 
-    seen = [r, v, five, time_left, log_mass, one_hot, error, (10 * error).tanh(), draw, differs]
+    seen = [r, v, altitude_to_speed, time_left, log_mass, one_hot, error, (10 * error).tanh(), draw, differs]
     return torch.cat(seen, dim=-1)
 
 
 @torch.no_grad()
 def update_running_statistics(agent, averaged, args, batch):
-    """The mean flight: what dispersed flights are compared with. Ours."""
+    """Move the mean flight; the weights of what depends on it, and of the draw, begin at zero. Ours."""
     sees_more = args.dispersion or args.observe_draw
-    if sees_more and not agent.mean_flight.any():  # nominal flights had zeros there
-        new_inputs = len(DIFFERENCES) + batch.obs.shape[-1] - 9  # the differences, and the draw
+    if sees_more and not agent.mean_flight.any():
+        new_inputs = len(DIFFERENCES) + batch.obs.shape[-1] - 9  # differences and draw: zeros on nominal flights
         for network in (agent, averaged):  # evaluation flies the averaged one
-            network.encoder[0].weight[:, -new_inputs:] = 0.0  # at first they change nothing
+            network.encoder[0].weight[:, -new_inputs:] = 0.0  # so that they change nothing at first
     if args.dispersion:
         move_mean_flight(agent, batch)
 
 
 def move_mean_flight(agent, batch):
     """Move each step's row to the mean of this update's flights: at first all the way, then by a tenth."""
-    rows = agent.mean_flight[: len(batch.obs)]  # a view; the averaged agent copies it at its next step
+    rows = agent.mean_flight[: len(batch.obs)]  # (S, 7), a view: += changes the buffer, which the average copies
     alive = batch.alive[: len(rows)]
     _, _, compared = motion(agent, batch.obs[: len(rows)])
-    mean, _ = moments(compared, alive[..., None], 1)
-    share, _ = moments(alive, torch.ones_like(alive), 1)
+    mean, _ = moments(compared, alive[..., None], 1)  # (S, 1, 7)
+    share, _ = moments(alive, torch.ones_like(alive), 1)  # (S, 1), of the flights that live
     rate = torch.where(rows.any(dim=1, keepdim=True), 0.1, 1.0)
-    enough = share >= 0.25  # few flights say little
+    enough = share >= 0.25  # the mean of few flights says little
     rows += rate * enough * (mean[:, 0] - rows)
 
 
@@ -200,8 +207,8 @@ def shape_rewards(envs, args, progress, batch, episodes):
 def set_curriculum(envs, args, progress, refines, std):
     """What only training changes, all of it ours; returns how many flights in a row have the same start, or draw.
 
-    R_terminal's scale follows the noise, which scatters the ends of the flights by about std / 10: std / 8, at most
-    TERMINAL_SCALE, on dispersed flights at least 0.001 (smaller was no better).
+    The noise scatters the ends of the flights by about std / 10, so R_terminal's scale follows it. It is std / 8, at
+    most TERMINAL_SCALE, and on dispersed flights at least 0.001 (smaller was no better).
     """
     envs.guidance = args.guidance
     if args.guidance == "auto":
@@ -358,7 +365,7 @@ class Agent(nn.Module):
         self.memory_length = args.memory_length
         self.embed_dim = d
 
-        # constants of the problem, saved with the weights; `features` and `mean_action` read them as agent.<name>
+        # buffers of the problem, saved with the weights; `features` and `mean_action` read them as agent.<name>
         constants = {**BUFFERS[args.env_id], "action_scale": envs.single_action_space.high.tolist()}
         for name, value in constants.items():
             self.register_buffer(name, torch.tensor(value))
@@ -433,7 +440,7 @@ class Agent(nn.Module):
 # Shared: PPO (Algorithm 1) --------------------------------------------------------------------------------------------
 @dataclass
 class Batch:
-    """The episodes of one update; `alive` is 1 for steps before an episode's end, 0 after it."""
+    """The episodes of one update; `alive` is 1 up to an episode's last step, 0 after it."""
 
     obs: torch.Tensor  # (T, N, obs)
     actions: torch.Tensor  # (T, N, actions)
@@ -441,9 +448,9 @@ class Batch:
     rewards: torch.Tensor  # (T, N), scaled
     values: torch.Tensor  # (T, N), the critic's output
     alive: torch.Tensor  # (T, N)
-    memory: torch.Tensor  # (blocks, N, L, d), m_0; what follows, encode makes anew from obs, with gradients
-    advantages: torch.Tensor | None = None  # (T, N), set by train, as is the next
-    returns: torch.Tensor | None = None  # (T, N), what the critic learns: (returns - b) / c of `returns_baseline`
+    memory: torch.Tensor  # (blocks, N, L, d), m_0; encode recomputes the later memory, with gradients
+    advantages: torch.Tensor | None = None  # (T, N), set by train
+    returns: torch.Tensor | None = None  # (T, N), set by train: (returns - b) / c of `returns_baseline`
 
 
 @torch.no_grad()
@@ -454,9 +461,9 @@ def rollout(agent, envs, reward_scale, memory_noise):
     batch = Batch(
         obs=zeros(T, N, *envs.single_observation_space.shape),
         actions=zeros(T, N, *envs.single_action_space.shape),
-        logprobs=zeros(T, N),
+        logprobs=zeros(T, N),  # set after the flight
         rewards=zeros(T, N),
-        values=zeros(T, N),
+        values=zeros(T, N),  # set after the flight
         alive=zeros(T, N),
         memory=agent.new_memory(N, memory_noise),  # line 5
     )
@@ -484,7 +491,8 @@ def rollout(agent, envs, reward_scale, memory_noise):
 
     batch.logprobs, _, batch.values = agent.evaluate_actions(hidden, batch.actions)  # v_t of line 8
     of_each_process = runs.all_gather(episodes)
-    return batch, {key: np.concatenate([part[key] for part in of_each_process]) for key in episodes}
+    all_episodes = {key: np.concatenate([part[key] for part in of_each_process]) for key in episodes}
+    return batch, all_episodes
 
 
 def gae(rewards, values, alive, gamma, gae_lambda):
@@ -513,9 +521,9 @@ def moments(x, alive, dim):
 def linear_fit(x, y, alive):
     """Ridge regression of y (..., G) on x (..., G, k) over the G episodes of a group that live: the fitted y.
 
-    Each episode is in its own fit. Its residual is 1 - l times that of a fit without it (scaled and ridged alike),
-    with the leverage l a function of the states at this step alone, not of the action: a state's gradient keeps its
-    direction, extreme states count less. (A fit without it was worse: docs/training-notes.md.)
+    Each episode is in its own fit. This shrinks its residual by the factor 1 - l, where l is its leverage. l depends
+    on the states at this step, not on the action: a state's gradient keeps its direction, and extreme states count
+    less. (A fit without it was worse: docs/training-notes.md.)
     """
     x, y = x.double(), y.double()[..., None]
     weight = alive.double()[..., None]  # (..., G, 1)
@@ -534,16 +542,18 @@ def returns_baseline(batch, gamma, group):
 
     Each `group` of episodes that follow one another flew the same start. b regresses their returns from step t on
     linearly on the states that they have reached by then, c is the spread of what is left. With small noise a critic's
-    error is larger than what an action changes; flights of one start, compared with one another, show it.
+    error is larger than what an action changes; comparing flights of one start shows what an action changes.
     """
     if group == 1:
         return torch.zeros_like(batch.rewards), torch.ones_like(batch.rewards[:, :1])
     no_values = torch.zeros_like(batch.values)
     returns, _ = gae(batch.rewards, no_values, batch.alive, gamma, 1.0)  # Monte-Carlo
-    obs, grouped_returns, alive = (x.unflatten(1, (-1, group)) for x in (batch.obs, returns, batch.alive))
+    obs = batch.obs.unflatten(1, (-1, group))
+    grouped_returns = returns.unflatten(1, (-1, group))
+    alive = batch.alive.unflatten(1, (-1, group))
     baseline = linear_fit(obs, grouped_returns, alive).flatten(1)
     _, variance = moments(returns - baseline, batch.alive, 1)
-    floor = 0.3 * variance.sqrt().mean()  # some steps have next to no spread; those after every end count, with none
+    floor = 0.3 * variance.sqrt().mean()  # for steps of next to no spread; steps after every end count as zeros
     return baseline, (variance + floor**2 + 1e-8).sqrt()
 
 
@@ -616,8 +626,9 @@ def train(args, agent, average, optimizer, envs, run):
     refine_from = math.inf if args.refine_from is None else args.refine_from
     for iteration in range(run.updates_done + 1, args.total_updates + 1):  # line 2
         progress = (iteration - 1) / last
-        refines = progress >= refine_from
-        if refines and (iteration - 2) / last < refine_from:  # the first update that does
+        progress_before = (iteration - 2) / last
+        refines = refine_from <= progress
+        if progress_before < refine_from <= progress:
             begin_refinement(agent, args)
         agent.actor_logstd.requires_grad_(args.noise == "learned" and not refines)
         std = agent.actor_logstd.exp().mean().item()
@@ -668,11 +679,11 @@ def train(args, agent, average, optimizer, envs, run):
 
         update_running_statistics(agent, average.module, args, batch)
 
-        # the noise of the next update: linear to its last value, from wherever it is
+        # the noise of the next update: an equal step of what is left to --log-std-final
         if args.noise == "schedule" or refines:
             updates_left = max(args.total_updates - iteration, 1)
             agent.actor_logstd.data += (args.log_std_final - agent.actor_logstd.data) / updates_left
-        agent.actor_logstd.data.clamp_(*LOG_STD_RANGE)  # learned beyond it, it would have no gradient to come back by
+        agent.actor_logstd.data.clamp_(*LOG_STD_RANGE)  # beyond it get_policy's clamp leaves no gradient
         run.end_update(iteration, batch.alive, episodes, means, learning_rate)
 
 

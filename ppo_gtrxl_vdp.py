@@ -279,7 +279,7 @@ class Agent(nn.Module):
         self.memory_length = args.memory_length
         self.embed_dim = d
 
-        # constants of the problem, saved with the weights; `features` and `mean_action` read them as agent.<name>
+        # buffers of the problem, saved with the weights; `features` and `mean_action` read them as agent.<name>
         constants = {**BUFFERS[args.env_id], "action_scale": envs.single_action_space.high.tolist()}
         for name, value in constants.items():
             self.register_buffer(name, torch.tensor(value))
@@ -354,7 +354,7 @@ class Agent(nn.Module):
 # Shared: PPO (Algorithm 1) --------------------------------------------------------------------------------------------
 @dataclass
 class Batch:
-    """The episodes of one update; `alive` is 1 for steps before an episode's end, 0 after it."""
+    """The episodes of one update; `alive` is 1 up to an episode's last step, 0 after it."""
 
     obs: torch.Tensor  # (T, N, obs)
     actions: torch.Tensor  # (T, N, actions)
@@ -362,9 +362,9 @@ class Batch:
     rewards: torch.Tensor  # (T, N), scaled
     values: torch.Tensor  # (T, N), the critic's output
     alive: torch.Tensor  # (T, N)
-    memory: torch.Tensor  # (blocks, N, L, d), m_0; what follows, encode makes anew from obs, with gradients
-    advantages: torch.Tensor | None = None  # (T, N), set by train, as is the next
-    returns: torch.Tensor | None = None  # (T, N), what the critic learns: (returns - b) / c of `returns_baseline`
+    memory: torch.Tensor  # (blocks, N, L, d), m_0; encode recomputes the later memory, with gradients
+    advantages: torch.Tensor | None = None  # (T, N), set by train
+    returns: torch.Tensor | None = None  # (T, N), set by train: (returns - b) / c of `returns_baseline`
 
 
 @torch.no_grad()
@@ -375,9 +375,9 @@ def rollout(agent, envs, reward_scale, memory_noise):
     batch = Batch(
         obs=zeros(T, N, *envs.single_observation_space.shape),
         actions=zeros(T, N, *envs.single_action_space.shape),
-        logprobs=zeros(T, N),
+        logprobs=zeros(T, N),  # set after the flight
         rewards=zeros(T, N),
-        values=zeros(T, N),
+        values=zeros(T, N),  # set after the flight
         alive=zeros(T, N),
         memory=agent.new_memory(N, memory_noise),  # line 5
     )
@@ -405,7 +405,8 @@ def rollout(agent, envs, reward_scale, memory_noise):
 
     batch.logprobs, _, batch.values = agent.evaluate_actions(hidden, batch.actions)  # v_t of line 8
     of_each_process = runs.all_gather(episodes)
-    return batch, {key: np.concatenate([part[key] for part in of_each_process]) for key in episodes}
+    all_episodes = {key: np.concatenate([part[key] for part in of_each_process]) for key in episodes}
+    return batch, all_episodes
 
 
 def gae(rewards, values, alive, gamma, gae_lambda):
@@ -434,9 +435,9 @@ def moments(x, alive, dim):
 def linear_fit(x, y, alive):
     """Ridge regression of y (..., G) on x (..., G, k) over the G episodes of a group that live: the fitted y.
 
-    Each episode is in its own fit. Its residual is 1 - l times that of a fit without it (scaled and ridged alike),
-    with the leverage l a function of the states at this step alone, not of the action: a state's gradient keeps its
-    direction, extreme states count less. (A fit without it was worse: docs/training-notes.md.)
+    Each episode is in its own fit. This shrinks its residual by the factor 1 - l, where l is its leverage. l depends
+    on the states at this step, not on the action: a state's gradient keeps its direction, and extreme states count
+    less. (A fit without it was worse: docs/training-notes.md.)
     """
     x, y = x.double(), y.double()[..., None]
     weight = alive.double()[..., None]  # (..., G, 1)
@@ -455,16 +456,18 @@ def returns_baseline(batch, gamma, group):
 
     Each `group` of episodes that follow one another flew the same start. b regresses their returns from step t on
     linearly on the states that they have reached by then, c is the spread of what is left. With small noise a critic's
-    error is larger than what an action changes; flights of one start, compared with one another, show it.
+    error is larger than what an action changes; comparing flights of one start shows what an action changes.
     """
     if group == 1:
         return torch.zeros_like(batch.rewards), torch.ones_like(batch.rewards[:, :1])
     no_values = torch.zeros_like(batch.values)
     returns, _ = gae(batch.rewards, no_values, batch.alive, gamma, 1.0)  # Monte-Carlo
-    obs, grouped_returns, alive = (x.unflatten(1, (-1, group)) for x in (batch.obs, returns, batch.alive))
+    obs = batch.obs.unflatten(1, (-1, group))
+    grouped_returns = returns.unflatten(1, (-1, group))
+    alive = batch.alive.unflatten(1, (-1, group))
     baseline = linear_fit(obs, grouped_returns, alive).flatten(1)
     _, variance = moments(returns - baseline, batch.alive, 1)
-    floor = 0.3 * variance.sqrt().mean()  # some steps have next to no spread; those after every end count, with none
+    floor = 0.3 * variance.sqrt().mean()  # for steps of next to no spread; steps after every end count as zeros
     return baseline, (variance + floor**2 + 1e-8).sqrt()
 
 
@@ -537,8 +540,9 @@ def train(args, agent, average, optimizer, envs, run):
     refine_from = math.inf if args.refine_from is None else args.refine_from
     for iteration in range(run.updates_done + 1, args.total_updates + 1):  # line 2
         progress = (iteration - 1) / last
-        refines = progress >= refine_from
-        if refines and (iteration - 2) / last < refine_from:  # the first update that does
+        progress_before = (iteration - 2) / last
+        refines = refine_from <= progress
+        if progress_before < refine_from <= progress:
             begin_refinement(agent, args)
         agent.actor_logstd.requires_grad_(args.noise == "learned" and not refines)
         std = agent.actor_logstd.exp().mean().item()
@@ -589,11 +593,11 @@ def train(args, agent, average, optimizer, envs, run):
 
         update_running_statistics(agent, average.module, args, batch)
 
-        # the noise of the next update: linear to its last value, from wherever it is
+        # the noise of the next update: an equal step of what is left to --log-std-final
         if args.noise == "schedule" or refines:
             updates_left = max(args.total_updates - iteration, 1)
             agent.actor_logstd.data += (args.log_std_final - agent.actor_logstd.data) / updates_left
-        agent.actor_logstd.data.clamp_(*LOG_STD_RANGE)  # learned beyond it, it would have no gradient to come back by
+        agent.actor_logstd.data.clamp_(*LOG_STD_RANGE)  # beyond it get_policy's clamp leaves no gradient
         run.end_update(iteration, batch.alive, episodes, means, learning_rate)
 
 
