@@ -5,6 +5,7 @@ import itertools
 import json
 import re
 import shlex
+import subprocess
 from pathlib import Path
 
 import memory
@@ -120,6 +121,17 @@ def measured(result, found):
         here += [(100 * abs(found["a_error_km"]) * 1e3 / rocket.a, 3, " %")]
         here += [(100 * abs(found["e_error"]) / rocket.e, 3, " %"), (abs(found["i_error_deg"]), 3, "°")]
     return optimum, here
+
+
+def test_edits_of_a_script_change_one_line():
+    """A page's `sed 's/old/new/' script` is for the script of today."""
+    edits = [edit for page in PAGES for edit in re.findall(r"`sed (?:-i )?('[^']*') (\w+\.py)", page.read_text())]
+    assert edits
+    for expression, script in edits:
+        text = (ROOT / script).read_text()
+        edited = subprocess.run(["sed", shlex.split(expression)[0]], input=text, capture_output=True, text=True).stdout
+        changed = [pair for pair in zip(text.splitlines(), edited.splitlines(), strict=True) if pair[0] != pair[1]]
+        assert len(changed) == 1, f"sed {expression} {script}"
 
 
 @pytest.mark.parametrize("result", [*OTHERS, *ROCKETS])
