@@ -113,7 +113,7 @@ SPEED = 8  # the circular speed there in km/s, rounded
 def motion(agent, obs):
     """Position and velocity (..., 3) each, and the seven quantities that flights are compared by (..., 7).
 
-    In the target orbit's axes, in Earth radii and circular speeds.
+    Position and velocity are in the target orbit's axes, in Earth radii and circular speeds.
     """
     r, v, mass = (obs[..., :7] / agent.units).split([3, 3, 1], dim=-1)
     r, v = r @ agent.axes.T, v @ agent.axes.T  # towards the perigee, along the semi-latus rectum, normal to the plane
@@ -153,8 +153,8 @@ def features(agent, obs):
 
     step = ((1 - time_left[..., 0]) * agent.steps).round().long()
     mean = agent.mean_flight[step.clamp(max=len(agent.mean_flight) - 1)]
-    has_flown = mean.any(dim=-1, keepdim=True)  # zeros: no mean yet, too few flights lived to this step
-    differs = has_flown * ((compared - mean) / agent.differences).clamp(-10, 10)
+    has_mean = mean.any(dim=-1, keepdim=True)  # zeros: no mean yet, too few flights lived to this step
+    differs = has_mean * ((compared - mean) / agent.differences).clamp(-10, 10)
 
     seen = [r, v, altitude_to_speed, time_left, log_mass, one_hot, error, (10 * error).tanh(), draw, differs]
     return torch.cat(seen, dim=-1)
