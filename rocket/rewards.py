@@ -66,7 +66,7 @@ TERMINAL_SCALE = 0.005  # of the reported R_terminal
 def terminal_reward(error_norm, scale=TERMINAL_SCALE):
     """R_terminal = -2 ln(1 + d / scale) at the episode's end, d the norm of the terminal error: steep near the target.
 
-    In place of the paper's points (see below). A norm, unlike R_orbital's sum: near the target the largest
+    In place of the paper's points (`precision_points`). A norm, unlike R_orbital's sum: near the target the largest
     component is the one to work on, and the noise in the others, which a sum of absolute values charges in full, hardly
     counts. Errors far below the scale earn almost the same, so a scale that shrinks with the policy's noise is a
     curriculum of training.
