@@ -1,11 +1,13 @@
 """PPO with a Gated Transformer-XL on the double integrator, measured against the true optimum in the same run.
 
-    python ppo_gtrxl_di.py --seed 1                             # Table 1, ours where it is silent
-    python ppo_gtrxl_di.py --seed 1 --env-id DoubleIntegratorWaypoints-v0      # two waypoints, one policy
+    python ppo_gtrxl_di.py --seed 1                                        # by our recipe, as results/di
+    python ppo_gtrxl_di.py --seed 1 --env-id DoubleIntegratorWaypoints-v0  # two waypoints, one policy
+    python ppo_gtrxl_di.py --seed 1 --recipe paper                         # Table 1 as printed
     python ppo_gtrxl_di.py --eval-only --checkpoint results/di/agent.safetensors
 
-Top to bottom: arguments, problem, Gated Transformer-XL, agent, PPO, training, main. From the first
-"Shared" on, all ppo_gtrxl_*.py are the same to the letter. T steps, N environments, L memory, d width, H heads.
+Top to bottom: arguments, recipes, problem, Gated Transformer-XL, agent, PPO, what we add to it, training, main.
+From the first "Shared" on, all ppo_gtrxl_*.py are the same to the letter. T steps, N environments, L memory, d width,
+H heads.
 """
 
 from __future__ import annotations
@@ -22,14 +24,17 @@ from torch.distributions import Normal
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 import runs
-from runs import all_reduce_sum
+from runs import Schedule, all_reduce_sum
 
 
 @dataclass
 class Args:
+    """The paper: Table 1's column of this problem, and what it leaves open. RECIPES has what we change."""
+
     # experiment
     exp_name: str = Path(__file__).stem  # the name of this experiment
     seed: int = 1  # seed of the experiment
+    recipe: str = "ours"  # what no flag sets: ours (RECIPES) or paper (Table 1 and nothing of ours in the learning)
     torch_deterministic: bool = True  # if toggled, `torch.backends.cudnn.deterministic=True`
     cuda: bool = True  # if toggled, a GPU is used when there is one
     num_threads: int = 1  # CPU threads of torch (0: torch's own choice); bits depend on it
@@ -42,18 +47,16 @@ class Args:
     checkpoint: str | None = None  # start from these weights (.safetensors)
     resume: str | None = None  # run folder of an interrupted run to go on with, bit for bit
     eval_only: bool = False  # fly the mean action of --checkpoint, train nothing, write only --eval-json and --eval-npz
-    eval_starts: int | None = None  # number of evaluation starts (default: 1000 with --eval-only, 50 at a run's end)
+    eval_starts: int | None = None  # number of evaluation starts (default: 1000; a training cut short: 50)
     eval_seed: int = 0  # seed of the evaluation starts
     eval_json: str | None = None  # where --eval-only writes the metrics
     eval_npz: str | None = None  # where --eval-only writes the trajectories
-    eval_every: int = 0  # evaluate every so many updates, on starts of its own (0: only at the end)
+    eval_every: int = 10  # evaluate every so many updates, on starts of its own (0: only at the end)
 
     # environment
     env_id: str = "DoubleIntegrator-v0"  # the id of the environment, one of ENV_IDS
     observe_phase: bool = True  # show time and phase to the policy
     observe_velocity: bool = True  # show the velocity to the policy
-    radius_curriculum: float = 12.0  # waypoints: training radius at first, in target radii (1: none, as in the paper)
-    reward_scale: float = 0.1  # factor on the rewards in training; everything logged is unscaled
 
     # transformer (Table 1)
     num_blocks: int = 3  # number of GTrXL blocks (0: a plain MLP, without memory)
@@ -62,39 +65,78 @@ class Args:
     memory_length: int = 32  # memory length L: a step attends to itself and the L steps before it
     mlp_dim: int = 128  # width of the position-wise MLP
     hidden_dim: int = 128  # width of the hidden layer of each head
-    memory_noise: float = 0.1  # spread of the memory before an episode (Algorithm 1, line 5; the value is ours)
-    memory_noise_final: float | None = None  # the same in the last update (linear in between; none: --memory-noise)
+    memory_noise: Schedule = 0.1  # spread of the memory before an episode (Algorithm 1, line 5: "small")
 
     # PPO (Table 1 where it has a row; docs/decisions.md has the rest)
     total_updates: int = 1000  # number of updates
     num_envs: int = 80  # parallel environments, one episode each per update (256 steps of 16 workers, a guess)
-    learning_rate: float = 3e-4  # learning rate of the first update; with --lr-schedule std it is this times sigma
-    learning_rate_final: float = 3e-5  # learning rate of the last update (linear in between; unused with std)
+    learning_rate: Schedule = "0:3e-4 1:3e-5"  # the learning rate of the optimizer
     gamma: float = 0.99  # the discount factor gamma
-    gae_lambda: float = 0.95  # the lambda for the general advantage estimation
-    gae_lambda_final: float | None = None  # the same in the last update (linear in between; none: --gae-lambda)
+    gae_lambda: Schedule = 0.95  # the lambda for the general advantage estimation
     num_minibatches: int = 4  # the number of mini-batches of whole episodes
     update_epochs: int = 8  # the K epochs to update the policy
     norm_adv: bool = True  # normalise the advantages over an update
     clip_coef: float = 0.2  # the surrogate clipping coefficient
-    ent_coef: float = 1e-3  # coefficient of the entropy in the first update
-    ent_coef_final: float = 1e-4  # coefficient of the entropy in the last update (linear in between)
+    ent_coef: Schedule = "0:1e-3 1:1e-4"  # coefficient of the entropy
     vf_coef: float = 0.2  # coefficient of the value function
     max_grad_norm: float = 0.5  # the maximum norm for the gradient clipping
     target_kl: float | None = None  # the KL divergence from which an update takes no further step (none: no limit)
-    lr_schedule: str = "linear"  # linear, or std: --learning-rate times the policy's standard deviation
-    noise: str = "learned"  # who sets the log-std: learned (the optimiser) or schedule (linear)
-    log_std: float = 0.0  # initial log of the policy's std in the action's unit, -8 to 0.5 (else a --checkpoint's)
-    log_std_final: float = -4.0  # log-std of the last update, where it is not learned to the end
-    flights_per_start: int = 1  # flights of each start in the refinement, compared with one another (1: the paper)
-    refine_from: float | None = None  # part of the updates after which the refinement begins (none: never)
-    log_std_refine: float | None = None  # log-std at the refinement's beginning (none: as it is)
-    weight_average: float = 0.998  # decay, per optimiser step, of the averaged weights used in evaluation (0: off)
+    log_std: Schedule = 0.0  # log of the std in the unit of the action: a number, learned from there; points, set
+
+    # ours: off here, on in RECIPES
+    reward_scale: float = 1.0  # factor on the rewards in training; everything logged is unscaled
+    lr_times_std: bool = False  # multiply the learning rate by the policy's std
+    flights_per_start: Schedule = 1  # flights of each start, compared with one another
+    log_radius: Schedule = 0.0  # waypoints: log of the training radius in target radii
+    weight_average: float = 0.0  # decay, per optimiser step, of the averaged weights used in evaluation
+
+
+# Recipes: what ours changes -------------------------------------------------------------------------------------------
+# A schedule is "place:value place:value": 0 is the first update, 1 the last, linear in between. The noise falls as a
+# learned one would, until the flights are compared in groups; from there it falls evenly to next to nothing.
+OURS = {
+    "gae_lambda": "0:0.95 1:1",
+    "target_kl": 0.05,
+    "reward_scale": 0.1,
+    "lr_times_std": True,
+    "weight_average": 0.99,
+}
+RECIPES = {
+    "DoubleIntegrator-v0": {
+        **OURS,
+        "total_updates": 100,
+        "num_envs": 320,
+        "num_minibatches": 16,
+        "update_epochs": 2,
+        "learning_rate": 1.5e-3,
+        "gamma": 1.0,
+        "memory_noise": "0:0.1 1:0",
+        "log_std": "0:0 0.4:-0.6 0.4:-1.6 1:-3.8",
+        "flights_per_start": "0:1 0.4:1 0.4:8",
+    },
+    "DoubleIntegratorWaypoints-v0": {
+        **OURS,
+        "total_updates": 300,
+        "num_envs": 240,
+        "num_minibatches": 12,
+        "update_epochs": 2,
+        "learning_rate": 1e-3,
+        "log_std": "0:-0.5 0.3:-1.1 0.3:-1.6 1:-4.3",
+        "flights_per_start": "0:1 0.3:1 0.3:8",
+        "log_radius": "0:2.5 0.3:0 0.3:-0.1",
+    },
+}
+
+
+def recipe(args):
+    """What ours changes for the environment of `args`; one without a recipe takes the first."""
+    return RECIPES.get(args.env_id, RECIPES[ENV_IDS[0]])
 
 
 # Problem: what differs from the other scripts -------------------------------------------------------------------------
 ENV_IDS = ("DoubleIntegrator-v0", "DoubleIntegratorWaypoints-v0")
 ENV_OPTIONS = ("observe_phase", "observe_velocity")  # arguments of the environments
+FIXED_OPTIONS = {}  # those that no flag sets
 SIZES = dict(zip(ENV_IDS, (3, 6)))  # of an observation
 BUFFERS = {env_id: {"observation_scale": [1.0] * n} for env_id, n in SIZES.items()}  # `features` reads agent.<name>
 INITIAL_ACTION = [0.0]  # the policy's output before training, in units of the bound
@@ -110,29 +152,28 @@ def mean_action(output, action_scale):
     return output * action_scale
 
 
-def update_running_statistics(agent, averaged, args, batch):
-    """Nothing: no constant of these problems is learnt from flights."""
+def prepare(agent, args, env_options):
+    """Nothing: no constant of these problems is found by flying."""
 
 
 def shape_rewards(envs, args, progress, batch, episodes):
     """Nothing: training is paid what the environment pays."""
 
 
-def set_curriculum(envs, args, progress, refines, std):
+def set_curriculum(envs, args, progress):
     """What only training changes, all of it ours; returns how many flights in a row have the same start.
 
-    Many starts at first, in the refinement each one several times. The waypoints' radius is --radius-curriculum times
-    the true one at first and shrinks geometrically to it until the refinement, or 60 % of the updates. Refined flights
-    aim at a circle a tenth smaller, because the optimum lies on its edge. A miss then costs 50 a unit of distance (20
-    over 0.4): more than it saves (`circle_price` of baselines.py: 4 and 12), but not so much that it hides the cost.
+    Many starts at first, later each one several times. The waypoints' circles are wide at first, so that a flight finds
+    them, and shrink. Compared flights aim at a circle a tenth smaller, because the optimum lies on its edge. A miss
+    then costs 50 a unit of distance (20 over 0.4): more than it saves (`circle_price` of baselines.py: 4 and 12), but
+    not so much that it hides the cost.
     """
-    envs.flights_per_start = args.flights_per_start if refines else 1
-    shrinks_until = 0.6 if args.refine_from is None else args.refine_from
-    left = max(0.0, 1 - progress / shrinks_until) if shrinks_until else 0.0
+    group = round(at(args.flights_per_start, progress))
+    envs.flights_per_start = group
     if envs.problem.waypoints:
-        envs.radius_scale = 0.9 if refines else args.radius_curriculum**left
-        envs.bonus_width = 0.4 if refines else 0.0
-    return envs.flights_per_start
+        envs.radius_scale = math.exp(at(args.log_radius, progress))
+        envs.bonus_width = 0.4 if group > 1 else 0.0
+    return group
 
 
 def describe(episodes, metrics):
@@ -292,7 +333,8 @@ class Agent(nn.Module):
         self.actor = nn.Sequential(linear(d, hidden, gain=2**0.5), nn.GELU(), linear(hidden, actions, gain=0.01))
         self.actor[-1].bias.data = torch.tensor(INITIAL_ACTION)
         self.critic = nn.Sequential(linear(d, hidden, gain=2**0.5), nn.GELU(), linear(hidden, 1))
-        self.actor_logstd = nn.Parameter(torch.full((actions,), args.log_std), requires_grad=args.noise == "learned")
+        learned = not isinstance(args.log_std, str)  # a number: learned from there; points: set by them
+        self.actor_logstd = nn.Parameter(torch.full((actions,), at(args.log_std, 0.0)), requires_grad=learned)
 
     def new_memory(self, num_envs, noise):
         """m_0 ~ N(0, noise^2), drawn once per episode and block: (blocks, N, L, d)."""
@@ -432,45 +474,6 @@ def moments(x, alive, dim):
     return mean, variance
 
 
-def linear_fit(x, y, alive):
-    """Ridge regression of y (..., G) on x (..., G, k) over the G episodes of a group that live: the fitted y.
-
-    Each episode is in its own fit. This shrinks its residual by the factor 1 - l, where l is its leverage. l depends
-    on the states at this step, not on the action: a state's gradient keeps its direction, and extreme states count
-    less. (A fit without it was worse: docs/training-notes.md.)
-    """
-    x, y = x.double(), y.double()[..., None]
-    weight = alive.double()[..., None]  # (..., G, 1)
-    count = weight.sum(-2, keepdim=True).clamp(min=1)  # (..., 1, 1)
-    y_mean = (y * weight).sum(-2, keepdim=True) / count
-    x = (x - (x * weight).sum(-2, keepdim=True) / count) * weight  # centred
-    x = x / ((x * x).sum(-2, keepdim=True) / count).sqrt().add(1e-6)  # of unit spread
-    ridge = 0.01 * count * torch.eye(x.shape[-1]).to(x)  # what all episodes share has no slope
-    slope = torch.linalg.solve(x.mT @ x + ridge, x.mT @ (y - y_mean))
-    fitted = y_mean + x @ slope  # (..., G, 1)
-    return fitted[..., 0].to(alive.dtype)
-
-
-def returns_baseline(batch, gamma, group):
-    """b (T, N) and c (T, 1) of V(s, t) = b + c critic(s, t). Ours; with group 1, b = 0 and c = 1, it is the paper.
-
-    Each `group` of episodes that follow one another flew the same start. b regresses their returns from step t on
-    linearly on the states that they have reached by then, c is the spread of what is left. With small noise a critic's
-    error is larger than what an action changes; comparing flights of one start shows what an action changes.
-    """
-    if group == 1:
-        return torch.zeros_like(batch.rewards), torch.ones_like(batch.rewards[:, :1])
-    no_values = torch.zeros_like(batch.values)
-    returns, _ = gae(batch.rewards, no_values, batch.alive, gamma, 1.0)  # Monte-Carlo
-    obs = batch.obs.unflatten(1, (-1, group))
-    grouped_returns = returns.unflatten(1, (-1, group))
-    alive = batch.alive.unflatten(1, (-1, group))
-    baseline = linear_fit(obs, grouped_returns, alive).flatten(1)
-    _, variance = moments(returns - baseline, batch.alive, 1)
-    floor = 0.3 * variance.sqrt().mean()  # for steps of next to no spread; steps after every end count as zeros
-    return baseline, (variance + floor**2 + 1e-8).sqrt()
-
-
 def explained_variance(prediction, returns, alive):
     """1 - Var(returns - prediction) / Var(returns) over the living steps, as CleanRL's."""
     _, left = moments(returns - prediction, alive, (0, 1))
@@ -515,45 +518,95 @@ def ppo_loss(agent, batch, mb, clip_coef, vf_coef, ent_coef):
     return loss, dict(zip(losses, of_all_processes))
 
 
+# Shared, ours: what we add to PPO -------------------------------------------------------------------------------------
+def at(schedule, progress):
+    """The value of "0:-1 0.4:-2 1:-6" at `progress`, 0 in the first update and 1 in the last; a number is constant.
+
+    Linear between the points; of two points at one place the second counts from there on.
+    """
+    if not isinstance(schedule, str):
+        return schedule
+    points = [point.split(":") for point in schedule.split()]
+    places = [float(place) for place, _ in points]
+    values = [float(value) for _, value in points]
+    return float(np.interp(progress, places, values))
+
+
+def set_noise(agent, args, progress):
+    """Set the log-std where it is not learned; returns the learning rate of this update.
+
+    Two Gaussians of one std whose means differ by d have a KL divergence of d^2 / (2 std^2). The less noise, the
+    further an optimiser's step of fixed size moves the policy. With a rate in proportion to the std it moves it equally
+    far at any noise, so that the noise can fall by a factor of hundreds and the policy still learns.
+    """
+    if agent.actor_logstd.requires_grad:
+        agent.actor_logstd.data.clamp_(*LOG_STD_RANGE)  # beyond it get_policy's clamp leaves no gradient
+    else:
+        agent.actor_logstd.data.fill_(at(args.log_std, progress))
+    learning_rate = at(args.learning_rate, progress)
+    if args.lr_times_std:
+        learning_rate *= agent.actor_logstd.exp().mean().item()
+    return learning_rate
+
+
+def linear_fit(x, y, alive):
+    """Ridge regression of y (..., G) on x (..., G, k) over the G episodes of a group that live: the fitted y.
+
+    Each episode is in its own fit. This shrinks its residual by the factor 1 - l, where l is its leverage. l depends
+    on the states at this step, not on the action: a state's gradient keeps its direction, and extreme states count
+    less. (A fit without it was worse: docs/training-notes.md.)
+    """
+    x, y = x.double(), y.double()[..., None]
+    weight = alive.double()[..., None]  # (..., G, 1)
+    count = weight.sum(-2, keepdim=True).clamp(min=1)  # (..., 1, 1)
+    y_mean = (y * weight).sum(-2, keepdim=True) / count
+    x = (x - (x * weight).sum(-2, keepdim=True) / count) * weight  # centred
+    x = x / ((x * x).sum(-2, keepdim=True) / count).sqrt().add(1e-6)  # of unit spread
+    ridge = 0.01 * count * torch.eye(x.shape[-1]).to(x)  # what all episodes share has no slope
+    slope = torch.linalg.solve(x.mT @ x + ridge, x.mT @ (y - y_mean))
+    fitted = y_mean + x @ slope  # (..., G, 1)
+    return fitted[..., 0].to(alive.dtype)
+
+
+def returns_baseline(batch, gamma, group):
+    """b (T, N) and c (T, 1) of the value V(s, t) = b + c critic(s, t); with group 1 the paper's, b = 0 and c = 1.
+
+    Each `group` of episodes that follow one another flew the same start. b regresses their returns from step t on
+    linearly on the states that they have reached by then, c is the spread of what is left. With small noise a critic's
+    error is larger than what an action changes; comparing flights of one start shows what an action changes.
+
+    Relatives: the mean return of other samples of the same question as the baseline (RLOO, Kool et al. 2019), or of the
+    whole group, in units of its spread (GRPO, Shao et al. 2024). They have one return a sample, we one a step; hence
+    the regression on the state, a linear control variate.
+    """
+    if group == 1:
+        return torch.zeros_like(batch.rewards), torch.ones_like(batch.rewards[:, :1])
+    no_values = torch.zeros_like(batch.values)
+    returns, _ = gae(batch.rewards, no_values, batch.alive, gamma, 1.0)  # Monte-Carlo
+    obs = batch.obs.unflatten(1, (-1, group))
+    grouped_returns = returns.unflatten(1, (-1, group))
+    alive = batch.alive.unflatten(1, (-1, group))
+    baseline = linear_fit(obs, grouped_returns, alive).flatten(1)
+    _, variance = moments(returns - baseline, batch.alive, 1)
+    floor = 0.3 * variance.sqrt().mean()  # for steps of next to no spread; steps after every end count as zeros
+    return baseline, (variance + floor**2 + 1e-8).sqrt()
+
+
 # Shared: training (Algorithm 1) and main ------------------------------------------------------------------------------
-def linear_schedule(first, last, progress):
-    """`first` in the first update (progress 0), `last` in the last one (progress 1), linear in between."""
-    return first + (last - first) * progress
-
-
-def begin_refinement(agent, args):
-    """From here on the noise is set, not learned; where starts are flown in groups, V begins anew as their baseline."""
-    if args.log_std_refine is not None:
-        nn.init.constant_(agent.actor_logstd, args.log_std_refine)
-    if args.flights_per_start > 1:
-        for parameter in agent.critic[-1].parameters():
-            nn.init.zeros_(parameter)
-
-
 def train(args, agent, average, optimizer, envs, run):
     """Algorithm 1, its lines beside ours. `run` counts, logs, saves and evaluates; it changes nothing that is learned.
 
     Raises FloatingPointError, before the optimiser moves the weights, when a loss or the gradient is not finite.
     """
-    last = max(args.total_updates - 1, 1)
     target_kl = math.inf if args.target_kl is None else args.target_kl
-    refine_from = math.inf if args.refine_from is None else args.refine_from
     for iteration in range(run.updates_done + 1, args.total_updates + 1):  # line 2
-        progress = (iteration - 1) / last
-        progress_before = (iteration - 2) / last
-        refines = refine_from <= progress
-        if progress_before < refine_from <= progress:
-            begin_refinement(agent, args)
-        agent.actor_logstd.requires_grad_(args.noise == "learned" and not refines)
-        std = agent.actor_logstd.exp().mean().item()
-        learning_rate = linear_schedule(args.learning_rate, args.learning_rate_final, progress)
-        if args.lr_schedule == "std":
-            learning_rate = args.learning_rate * std
+        progress = (iteration - 1) / max(args.total_updates - 1, 1)
+        memory_noise = at(args.memory_noise, progress)
+        gae_lambda = at(args.gae_lambda, progress)
+        ent_coef = at(args.ent_coef, progress)
+        learning_rate = set_noise(agent, args, progress)
         optimizer.param_groups[0]["lr"] = learning_rate
-        ent_coef = linear_schedule(args.ent_coef, args.ent_coef_final, progress)
-        gae_lambda = linear_schedule(args.gae_lambda, args.gae_lambda_final, progress)  # None: by now --gae-lambda
-        memory_noise = linear_schedule(args.memory_noise, args.memory_noise_final, progress)
-        group = set_curriculum(envs, args, progress, refines, std)
+        group = set_curriculum(envs, args, progress)
 
         # lines 3-13: fly one episode in every environment
         batch, episodes = rollout(agent, envs, args.reward_scale, memory_noise)
@@ -591,25 +644,19 @@ def train(args, agent, average, optimizer, envs, run):
         means["explained_variance"] = explained_variance(batch.values, batch.returns, batch.alive)
         means["baseline_explained_variance"] = explained_variance(baseline, returns, batch.alive)
 
-        update_running_statistics(agent, average.module, args, batch)
-
-        # the noise of the next update: an equal step of what is left to --log-std-final
-        if args.noise == "schedule" or refines:
-            updates_left = max(args.total_updates - iteration, 1)
-            agent.actor_logstd.data += (args.log_std_final - agent.actor_logstd.data) / updates_left
-        agent.actor_logstd.data.clamp_(*LOG_STD_RANGE)  # beyond it get_policy's clamp leaves no gradient
         run.end_update(iteration, batch.alive, episodes, means, learning_rate)
 
 
 def main(argv):
-    args, saved = runs.parse_args(Args, argv, ENV_OPTIONS, BUFFERS)
+    args, saved = runs.parse_args(Args, recipe, argv, ENV_OPTIONS, BUFFERS)
     device = runs.prepare_torch(args)
-    env_options = {name: getattr(args, name) for name in ENV_OPTIONS}
+    env_options = {name: getattr(args, name) for name in ENV_OPTIONS} | FIXED_OPTIONS
     envs = runs.make_envs(args, env_options)
     agent = Agent(args, envs).to(device)
     runs.load_checkpoint(agent, args, saved)
+    prepare(agent, args, env_options)
     average = AveragedModel(agent, multi_avg_fn=get_ema_multi_avg_fn(args.weight_average))
-    optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
+    optimizer = torch.optim.Adam(agent.parameters(), eps=1e-5, fused=True)  # train sets its learning rate
     run = runs.Run(
         args=args,
         saved=saved,

@@ -1,11 +1,14 @@
 """PPO with a Gated Transformer-XL on a four-phase rocket ascent, measured against the true optimum in the same run.
 
-    python ppo_gtrxl_rocket.py --seed 1  # the paper's 961 s, as results/rocket_fixed
-    python ppo_gtrxl_rocket.py --seed 1 --env-id RocketAscentCutoff-v0  # free end; flags: results/rocket_cutoff
+    python ppo_gtrxl_rocket.py --seed 1                                 # the paper's 961 s, as results/rocket_fixed
+    python ppo_gtrxl_rocket.py --seed 1 --env-id RocketAscentCutoff-v0  # free final time
+    python ppo_gtrxl_rocket.py --seed 1 --env-id RocketAscentCutoff-v0 --dispersion 1    # every flight another vehicle
+    python ppo_gtrxl_rocket.py --seed 1 --recipe paper                  # Table 1 as printed
     python ppo_gtrxl_rocket.py --eval-only --checkpoint results/rocket_fixed/agent.safetensors
 
-Top to bottom: arguments, problem, Gated Transformer-XL, agent, PPO, training, main. From the first
-"Shared" on, all ppo_gtrxl_*.py are the same to the letter. T steps, N environments, L memory, d width, H heads.
+Top to bottom: arguments, recipes, problem, Gated Transformer-XL, agent, PPO, what we add to it, training, main.
+From the first "Shared" on, all ppo_gtrxl_*.py are the same to the letter. T steps, N environments, L memory, d width,
+H heads.
 """
 
 from __future__ import annotations
@@ -14,6 +17,7 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -25,14 +29,17 @@ import runs
 from envs import ROCKETS
 from rocket.policy_constants import DIFFERENCES, policy_constants
 from rocket.rewards import TERMINAL_SCALE, mass_rewards
-from runs import all_reduce_sum
+from runs import Schedule, all_reduce_sum
 
 
 @dataclass
 class Args:
+    """The paper: Table 1's column of this problem, and what it leaves open. RECIPES has what we change."""
+
     # experiment
     exp_name: str = Path(__file__).stem  # the name of this experiment
     seed: int = 1  # seed of the experiment
+    recipe: str = "ours"  # what no flag sets: ours (RECIPES) or paper (Table 1 and nothing of ours in the learning)
     torch_deterministic: bool = True  # if toggled, `torch.backends.cudnn.deterministic=True`
     cuda: bool = True  # if toggled, a GPU is used when there is one
     num_threads: int = 1  # CPU threads of torch (0: torch's own choice); bits depend on it
@@ -45,7 +52,7 @@ class Args:
     checkpoint: str | None = None  # start from these weights (.safetensors)
     resume: str | None = None  # run folder of an interrupted run to go on with, bit for bit
     eval_only: bool = False  # fly the mean action of --checkpoint, train nothing, write only --eval-json and --eval-npz
-    eval_starts: int | None = None  # evaluation flights with --dispersion (none: 1705; on the nominal rocket one)
+    eval_starts: int | None = None  # flights of the evaluation with --dispersion (default: 1705; cut short: 100)
     eval_seed: int = 0  # seed of the evaluation starts
     eval_json: str | None = None  # where --eval-only writes the metrics
     eval_npz: str | None = None  # where --eval-only writes the trajectories
@@ -57,51 +64,113 @@ class Args:
     dispersion: float = 0.0  # size of the draws of vehicle and air: 0 none, 1 the table `envs.Dispersion`
     observe_draw: bool = False  # show the draw to the policy: an oracle
     observe_mass: bool = False  # show the true mass of a dispersed rocket, not the flight computer's
-    action_frame: str = "local"  # the thrust direction's axes: local (up, along-track, cross-track) or eci
-    guidance: str = "auto"  # R_guidance's pitch in training: none, linear or knots (auto: knots, with cut-off none)
-    mass_weight: float = 2.0  # cut-off: factor on `mass_rewards`, which compares 8 or more flights of a start
     reward_scale: float = 0.2  # factor on the rewards in training; everything logged is unscaled
 
-    # transformer (a laptop's; docs/decisions.md has Table 1's beside ours)
-    num_blocks: int = 2  # number of GTrXL blocks (0: a plain MLP, without memory)
-    embed_dim: int = 64  # embedding dimension d
-    num_heads: int = 4  # number of attention heads
-    memory_length: int = 32  # memory length L: a step attends to itself and the L steps before it
-    mlp_dim: int = 64  # width of the position-wise MLP
-    hidden_dim: int = 64  # width of the hidden layer of each head
-    memory_noise: float = 0.1  # spread of the memory before an episode (Algorithm 1, line 5; the value is ours)
-    memory_noise_final: float | None = 0.0  # the same in the last update (linear in between; none: --memory-noise)
+    # transformer (Table 1)
+    num_blocks: int = 6  # number of GTrXL blocks (0: a plain MLP, without memory)
+    embed_dim: int = 384  # embedding dimension d
+    num_heads: int = 8  # number of attention heads
+    memory_length: int = 256  # memory length L: a step attends to itself and the L steps before it
+    mlp_dim: int = 384  # width of the position-wise MLP
+    hidden_dim: int = 384  # width of the hidden layer of each head
+    memory_noise: Schedule = 0.1  # spread of the memory before an episode (Algorithm 1, line 5: "small")
 
-    # PPO (docs/decisions.md has Table 1's beside ours)
-    total_updates: int = 500  # number of updates
+    # PPO (Table 1 where it has a row; docs/decisions.md has the rest)
+    total_updates: int = 5000  # number of updates
     num_envs: int = 32  # parallel environments, one episode each per update
-    learning_rate: float = 3e-3  # learning rate of the first update; with --lr-schedule std it is this times sigma
-    learning_rate_final: float = 1e-5  # learning rate of the last update (linear in between; unused with std)
-    gamma: float = 1.0  # the discount factor gamma
-    gae_lambda: float = 0.985  # the lambda for the general advantage estimation
-    gae_lambda_final: float | None = 1.0  # the same in the last update (linear in between; none: --gae-lambda)
+    learning_rate: Schedule = "0:1e-4 1:5e-6"  # the learning rate of the optimizer
+    gamma: float = 0.99  # the discount factor gamma
+    gae_lambda: Schedule = 0.95  # the lambda for the general advantage estimation
     num_minibatches: int = 8  # the number of mini-batches of whole episodes
-    update_epochs: int = 6  # the K epochs to update the policy
+    update_epochs: int = 16  # the K epochs to update the policy
     norm_adv: bool = True  # normalise the advantages over an update
-    clip_coef: float = 0.2  # the surrogate clipping coefficient
-    ent_coef: float = 0.0  # coefficient of the entropy in the first update
-    ent_coef_final: float = 0.0  # coefficient of the entropy in the last update (linear in between)
-    vf_coef: float = 0.5  # coefficient of the value function
+    clip_coef: float = 0.12  # the surrogate clipping coefficient
+    ent_coef: Schedule = "0:1e-3 1:1e-4"  # coefficient of the entropy
+    vf_coef: float = 0.8  # coefficient of the value function
     max_grad_norm: float = 0.5  # the maximum norm for the gradient clipping
-    target_kl: float | None = 0.02  # the KL divergence from which an update takes no further step (none: no limit)
-    lr_schedule: str = "std"  # linear, or std: --learning-rate times the policy's standard deviation
-    noise: str = "schedule"  # who sets the log-std: learned (the optimiser) or schedule (linear)
-    log_std: float = -1.0  # initial log of the policy's std in the action's unit, -8 to 0.5 (else a --checkpoint's)
-    log_std_final: float = -6.0  # log-std of the last update, where it is not learned to the end
-    flights_per_start: int = 32  # flights of each start or draw, compared with one another: 16 or more (1: the paper)
-    refine_from: float | None = None  # part of the updates after which the refinement begins (none: never)
-    log_std_refine: float | None = None  # log-std at the refinement's beginning (none: as it is)
-    weight_average: float = 0.99  # decay, per optimiser step, of the averaged weights used in evaluation (0: off)
+    target_kl: float | None = None  # the KL divergence from which an update takes no further step (none: no limit)
+    log_std: Schedule = -1.4  # log of the std in the unit of the action: a number, learned from there; points, set
+
+    # ours: off here, on in RECIPES
+    lr_times_std: bool = False  # multiply the learning rate by the policy's std
+    flights_per_start: Schedule = 1  # flights of each start or draw, compared with one another
+    guidance: bool = False  # charge for leaving a pitch programme until 150.4 s (R_guidance)
+    mass_weight: Schedule = 0.0  # cut-off: factor on `mass_rewards`, which compare 8 or more flights
+    weight_average: float = 0.0  # decay, per optimiser step, of the averaged weights used in evaluation
+
+
+# Recipes: what ours changes -------------------------------------------------------------------------------------------
+# A schedule is "place:value place:value": 0 is the first update, 1 the last, linear in between. There is one start, so
+# all flights of an update are compared from the first update on. The network is a hundred times smaller than Table 1's.
+OURS = {
+    "num_blocks": 2,
+    "embed_dim": 64,
+    "num_heads": 4,
+    "memory_length": 32,
+    "mlp_dim": 64,
+    "hidden_dim": 64,
+    "update_epochs": 6,
+    "learning_rate": 3e-3,
+    "lr_times_std": True,
+    "gamma": 1.0,  # 0.99 is a horizon of 200 s, and what is steered early is paid at the end
+    "gae_lambda": "0:0.985 1:1",
+    "clip_coef": 0.2,
+    "ent_coef": 0.0,
+    "vf_coef": 0.5,
+    "target_kl": 0.02,
+    "flights_per_start": 32,
+}
+CUTOFF = {
+    **OURS,
+    "total_updates": 380,
+    "memory_noise": "0:0.01 1:0",
+    "log_std": "0:-1 1:-7.4",
+    "mass_weight": "0.1:0 0.2:2 0.5:2 0.85:0",
+    "weight_average": 0.998,
+}
+FIXED = {
+    **OURS,
+    "total_updates": 500,
+    "memory_noise": "0:0.1 1:0",
+    "log_std": "0:-1 1:-6",
+    "guidance": True,
+    "weight_average": 0.99,
+}
+DISPERSED = {  # goes on with a policy of the nominal flight
+    "total_updates": 150,
+    "num_envs": 64,
+    "flights_per_start": 16,
+    "gae_lambda": "0:0.995 1:1",
+    "memory_noise": "0:0.01 1:0",
+    "log_std": "0:-3.5 1:-6.5",
+    "mass_weight": "0.1:0 0.2:0.2 0.5:0.2 0.85:0",
+    "weight_average": 0.998,
+}
+RECIPES = {"RocketAscent-v0": FIXED, "RocketAscentCutoff-v0": CUTOFF, "TwoStageLEO-v0": CUTOFF}
+NOMINAL = {  # the policy with which a dispersed training begins
+    "RocketAscent-v0": "results/rocket_fixed/agent.safetensors",
+    "RocketAscentCutoff-v0": "results/rocket_cutoff/agent.safetensors",
+    "TwoStageLEO-v0": "results/two_stage_leo/agent.safetensors",
+}
+
+
+def recipe(args):
+    """What ours changes for the environments of `args`: an id without a recipe takes that of its family."""
+    family = CUTOFF if ROCKETS[args.env_id].cutoff else FIXED
+    nominal = RECIPES.get(args.env_id, family)
+    if not args.dispersion:
+        return nominal
+    first_policy = args.checkpoint or NOMINAL.get(args.env_id)
+    if first_policy is None:
+        print("--dispersion without a policy to begin with: train one without dispersion, and name it by --checkpoint")
+        return nominal
+    return {**nominal, **DISPERSED, "checkpoint": first_policy}
 
 
 # Problem: what differs from the other scripts -------------------------------------------------------------------------
 ENV_IDS = tuple(ROCKETS)
-ENV_OPTIONS = ("observe_phase", "action_frame", "dispersion", "observe_draw", "observe_mass")  # of the environments
+ENV_OPTIONS = ("observe_phase", "dispersion", "observe_draw", "observe_mass")  # arguments of the environments
+FIXED_OPTIONS = {"action_frame": "local"}  # those that no flag sets: up, along-track, cross-track
 BUFFERS = {env_id: policy_constants(mission.rocket) for env_id, mission in ROCKETS.items()}  # read as agent.<name>
 INITIAL_ACTION = [1.0, 0.0, 0.0]  # straight up (local frame): a randomly steered rocket never leaves the ground
 
@@ -111,9 +180,10 @@ SPEED = 8  # the circular speed there in km/s, rounded
 
 
 def motion(agent, obs):
-    """Position and velocity (..., 3) each, and the seven quantities that flights are compared by (..., 7).
+    """Position, velocity (..., 3) and specific energy (...) in the target orbit's axes and units, and more (..., 7).
 
-    Position and velocity are in the target orbit's axes, in Earth radii and circular speeds.
+    The units are the Earth's radius and the circular speed there. The seven quantities are those that flights are
+    compared by.
     """
     r, v, mass = (obs[..., :7] / agent.units).split([3, 3, 1], dim=-1)
     r, v = r @ agent.axes.T, v @ agent.axes.T  # towards the perigee, along the semi-latus rectum, normal to the plane
@@ -124,8 +194,9 @@ def motion(agent, obs):
     out_of_plane_speed = SPEED * v[..., 2:]
     speed = v.norm(dim=-1, keepdim=True)  # as it is, in circular speeds
     angle = torch.atan2(r[..., 1:2], r[..., :1])
+    energy = speed[..., 0] ** 2 / 2 - 1 / radius[..., 0]  # -1 / (2 a)
     compared = [altitude, climb, out_of_plane, out_of_plane_speed, speed, mass.log(), angle]
-    return r, v, torch.cat(compared, dim=-1)
+    return r, v, energy, torch.cat(compared, dim=-1)
 
 
 def features(agent, obs):
@@ -137,12 +208,13 @@ def features(agent, obs):
     - the orbit's error, [(h - h_T) / |h_T|, e - e_T] with h = r x v and e = v x h - r / |r| (mu = 1), and
       tanh(10 error), in which small errors show
     - the draw, with --observe-draw
-    - `motion`'s seven quantities less the mean flight's at this step, in units of `differences`, clipped at 10 (a sum
-      of such differences tells where the perigee will be; tanh would flatten them)
+    - `motion`'s seven quantities less those of the nominal flight at the same energy (`nominal_at`), in units of
+      `differences`, clipped at 10 (a sum of such differences tells where the perigee will be; tanh would flatten them);
+      zeros before a dispersed training
 
     The paper's observation, and ours, is r and v in ECI, m, t_norm and the phase.
     """
-    r, v, compared = motion(agent, obs)
+    r, v, energy, compared = motion(agent, obs)
     altitude_to_speed, log_mass = compared[..., :5], compared[..., 5:6]
     time_left, phase, draw = obs[..., 7:8], obs[..., 8:9], obs[..., 9:]
     one_hot = ((phase - agent.phases).abs() < 1e-3).to(obs.dtype)  # phase: 0 to 1 (the paper's 0 to 3)
@@ -151,37 +223,62 @@ def features(agent, obs):
     e = torch.linalg.cross(v, h) - r / r.norm(dim=-1, keepdim=True)
     error = torch.cat([(h - agent.h_target) / agent.h_target.norm(), e - agent.e_target], dim=-1)
 
-    step = ((1 - time_left[..., 0]) * agent.steps).round().long()
-    mean = agent.mean_flight[step.clamp(max=len(agent.mean_flight) - 1)]
-    has_mean = mean.any(dim=-1, keepdim=True)  # zeros: no mean yet, too few flights lived to this step
-    differs = has_mean * ((compared - mean) / agent.differences).clamp(-10, 10)
+    burn = one_hot.argmax(dim=-1).to(obs.dtype)
+    differs = (compared - nominal_at(agent, burn, energy)) / agent.differences
+    differs = torch.where(agent.nominal_flight.any(), differs.clamp(-10, 10), 0.0)
 
     seen = [r, v, altitude_to_speed, time_left, log_mass, one_hot, error, (10 * error).tanh(), draw, differs]
     return torch.cat(seen, dim=-1)
 
 
+def nominal_at(agent, burn, energy):
+    """`motion`'s seven quantities (..., 7) of the nominal flight in this burn (...) at this energy (...).
+
+    Two vehicles in the same burn at the same energy are as far on their way, whatever their clocks say. Between the
+    rows of `nominal_flight`, each of one step, the quantities are linear, and beyond a burn's rows they go on so.
+    """
+    burns, energies, flight = agent.nominal_flight.split([1, 1, 7], dim=-1)
+    burns, energies = burns[:, 0].contiguous(), energies[:, 0].contiguous()
+    first = torch.searchsorted(burns, burn)
+    last = torch.searchsorted(burns, burn, right=True) - 1
+    after = torch.searchsorted(burns + energies, burn + energy)  # energies are in -1 to 0: burns do not overlap
+    after = torch.minimum(torch.maximum(after, first + 1), last).clamp(min=1)
+    before = after - 1
+    share = (energy - energies[before]) / (energies[after] - energies[before]).clamp(min=1e-7)
+    return torch.lerp(flight[before], flight[after], share[..., None])
+
+
 @torch.no_grad()
-def update_running_statistics(agent, averaged, args, batch):
-    """Move the mean flight; the weights of what depends on it, and of the draw, begin at zero. Ours."""
-    sees_more = args.dispersion or args.observe_draw
-    if sees_more and not agent.mean_flight.any():
-        new_inputs = len(DIFFERENCES) + batch.obs.shape[-1] - 9  # differences and draw: zeros on nominal flights
-        for network in (agent, averaged):  # evaluation flies the averaged one
-            network.encoder[0].weight[:, -new_inputs:] = 0.0  # so that they change nothing at first
-    if args.dispersion:
-        move_mean_flight(agent, batch)
+def prepare(agent, args, env_options):
+    """Before a dispersed training: fly the nominal rocket once by the policy that it begins with, and keep the flight.
+
+    The weights of what depends on it, and of the draw, begin at zero, so that the policy is the same at first.
+    """
+    begins_with_a_policy = args.checkpoint is not None and args.resume is None and not args.eval_only
+    if not (args.dispersion and begins_with_a_policy) or agent.nominal_flight.any():
+        return
+    envs = gym.make_vec(args.env_id, num_envs=1, **{**env_options, "dispersion": 0.0})
+    fly_nominal(agent, agent.make_policy(envs.episode_steps), envs)
+    new_inputs = len(DIFFERENCES) + envs.single_observation_space.shape[0] - 9
+    agent.encoder[0].weight[:, -new_inputs:] = 0.0
 
 
-def move_mean_flight(agent, batch):
-    """Move each step's row to the mean of this update's flights: at first all the way, then by a tenth."""
-    rows = agent.mean_flight[: len(batch.obs)]  # (S, 7), a view: += changes the buffer, which the average copies
-    alive = batch.alive[: len(rows)]
-    _, _, compared = motion(agent, batch.obs[: len(rows)])
-    mean, _ = moments(compared, alive[..., None], 1)  # (S, 1, 7)
-    share, _ = moments(alive, torch.ones_like(alive), 1)  # (S, 1), of the flights that live
-    rate = torch.where(rows.any(dim=1, keepdim=True), 0.1, 1.0)
-    enough = share >= 0.25  # the mean of few flights says little
-    rows += rate * enough * (mean[:, 0] - rows)
+def fly_nominal(agent, policy, envs):
+    """Fly `policy(obs, t)` in one environment, and write the flight into the agent's `nominal_flight`."""
+    obs, _ = envs.reset()
+    flight = [obs]
+    has_ended = [False]
+    while not has_ended[0]:
+        obs, _, has_ended, _ = envs.advance(policy(obs, len(flight) - 1))
+        flight.append(obs)
+
+    obs = torch.as_tensor(np.concatenate(flight)).to(agent.nominal_flight)
+    _, _, energy, compared = motion(agent, obs)
+    rows = agent.nominal_flight[: len(obs)]
+    rows[:, 0] = (obs[:, 8] * (len(agent.phases) - 1)).round()
+    rows[:, 1] = energy.cummax(dim=0).values
+    rows[:, 2:] = compared
+    agent.nominal_flight[len(obs) :, 0] = len(agent.phases)  # after its end: a burn that there is not
 
 
 def mean_action(output, action_scale):
@@ -190,13 +287,16 @@ def mean_action(output, action_scale):
 
 
 def shape_rewards(envs, args, progress, batch, episodes):
-    """With cut-off, pay a flight's last step its `mass_rewards`, from 10 to 85 % of the updates. Ours."""
+    """With cut-off, pay a flight's last step its `mass_rewards`. Ours.
+
+    They cannot matter before the flights reach their orbit; at the end the orbit alone counts.
+    """
     if not envs.cutoff:
         return
-    weight = args.mass_weight * np.interp(progress, [0.1, 0.2, 0.5, 0.85], [0.0, 1.0, 1.0, 0.0])
+    weight = at(args.mass_weight, progress)
     if weight == 0:
         return
-    group_size = args.flights_per_start if args.dispersion else len(episodes["error"])
+    group_size = envs.flights_per_start if args.dispersion else len(episodes["error"])
     paid = weight * mass_rewards(episodes, envs.rocket, envs.terminal_scale, group_size)
     paid = runs.local_shard(paid, envs.num_envs)  # of this process's flights
     last_step = batch.alive.sum(0).long() - 1  # (N,)
@@ -204,18 +304,17 @@ def shape_rewards(envs, args, progress, batch, episodes):
     batch.rewards[last_step, flight] += torch.as_tensor(paid * args.reward_scale).to(batch.rewards)
 
 
-def set_curriculum(envs, args, progress, refines, std):
+def set_curriculum(envs, args, progress):
     """What only training changes, all of it ours; returns how many flights in a row have the same start, or draw.
 
-    The noise scatters the ends of the flights by about std / 10, so R_terminal's scale follows it. It is std / 8, at
-    most TERMINAL_SCALE, and on dispersed flights at least 0.001 (smaller was no better).
+    The noise scatters the ends of the flights by about std / 10, so R_terminal's scale follows it once it is small.
+    On dispersed flights the scale is at least 0.001 (smaller was no better). A learned noise leaves it as it is.
     """
-    envs.guidance = args.guidance
-    if args.guidance == "auto":
-        envs.guidance = "none" if envs.cutoff else "knots"
+    std = math.exp(at(args.log_std, progress))
     smallest = 0.001 if args.dispersion else 0.0
     envs.terminal_scale = min(TERMINAL_SCALE, max(std / 8, smallest))
-    envs.flights_per_start = args.flights_per_start
+    envs.guidance = args.guidance
+    envs.flights_per_start = round(at(args.flights_per_start, progress))
     return envs.flights_per_start
 
 
@@ -378,7 +477,8 @@ class Agent(nn.Module):
         self.actor = nn.Sequential(linear(d, hidden, gain=2**0.5), nn.GELU(), linear(hidden, actions, gain=0.01))
         self.actor[-1].bias.data = torch.tensor(INITIAL_ACTION)
         self.critic = nn.Sequential(linear(d, hidden, gain=2**0.5), nn.GELU(), linear(hidden, 1))
-        self.actor_logstd = nn.Parameter(torch.full((actions,), args.log_std), requires_grad=args.noise == "learned")
+        learned = not isinstance(args.log_std, str)  # a number: learned from there; points: set by them
+        self.actor_logstd = nn.Parameter(torch.full((actions,), at(args.log_std, 0.0)), requires_grad=learned)
 
     def new_memory(self, num_envs, noise):
         """m_0 ~ N(0, noise^2), drawn once per episode and block: (blocks, N, L, d)."""
@@ -518,45 +618,6 @@ def moments(x, alive, dim):
     return mean, variance
 
 
-def linear_fit(x, y, alive):
-    """Ridge regression of y (..., G) on x (..., G, k) over the G episodes of a group that live: the fitted y.
-
-    Each episode is in its own fit. This shrinks its residual by the factor 1 - l, where l is its leverage. l depends
-    on the states at this step, not on the action: a state's gradient keeps its direction, and extreme states count
-    less. (A fit without it was worse: docs/training-notes.md.)
-    """
-    x, y = x.double(), y.double()[..., None]
-    weight = alive.double()[..., None]  # (..., G, 1)
-    count = weight.sum(-2, keepdim=True).clamp(min=1)  # (..., 1, 1)
-    y_mean = (y * weight).sum(-2, keepdim=True) / count
-    x = (x - (x * weight).sum(-2, keepdim=True) / count) * weight  # centred
-    x = x / ((x * x).sum(-2, keepdim=True) / count).sqrt().add(1e-6)  # of unit spread
-    ridge = 0.01 * count * torch.eye(x.shape[-1]).to(x)  # what all episodes share has no slope
-    slope = torch.linalg.solve(x.mT @ x + ridge, x.mT @ (y - y_mean))
-    fitted = y_mean + x @ slope  # (..., G, 1)
-    return fitted[..., 0].to(alive.dtype)
-
-
-def returns_baseline(batch, gamma, group):
-    """b (T, N) and c (T, 1) of V(s, t) = b + c critic(s, t). Ours; with group 1, b = 0 and c = 1, it is the paper.
-
-    Each `group` of episodes that follow one another flew the same start. b regresses their returns from step t on
-    linearly on the states that they have reached by then, c is the spread of what is left. With small noise a critic's
-    error is larger than what an action changes; comparing flights of one start shows what an action changes.
-    """
-    if group == 1:
-        return torch.zeros_like(batch.rewards), torch.ones_like(batch.rewards[:, :1])
-    no_values = torch.zeros_like(batch.values)
-    returns, _ = gae(batch.rewards, no_values, batch.alive, gamma, 1.0)  # Monte-Carlo
-    obs = batch.obs.unflatten(1, (-1, group))
-    grouped_returns = returns.unflatten(1, (-1, group))
-    alive = batch.alive.unflatten(1, (-1, group))
-    baseline = linear_fit(obs, grouped_returns, alive).flatten(1)
-    _, variance = moments(returns - baseline, batch.alive, 1)
-    floor = 0.3 * variance.sqrt().mean()  # for steps of next to no spread; steps after every end count as zeros
-    return baseline, (variance + floor**2 + 1e-8).sqrt()
-
-
 def explained_variance(prediction, returns, alive):
     """1 - Var(returns - prediction) / Var(returns) over the living steps, as CleanRL's."""
     _, left = moments(returns - prediction, alive, (0, 1))
@@ -601,45 +662,95 @@ def ppo_loss(agent, batch, mb, clip_coef, vf_coef, ent_coef):
     return loss, dict(zip(losses, of_all_processes))
 
 
+# Shared, ours: what we add to PPO -------------------------------------------------------------------------------------
+def at(schedule, progress):
+    """The value of "0:-1 0.4:-2 1:-6" at `progress`, 0 in the first update and 1 in the last; a number is constant.
+
+    Linear between the points; of two points at one place the second counts from there on.
+    """
+    if not isinstance(schedule, str):
+        return schedule
+    points = [point.split(":") for point in schedule.split()]
+    places = [float(place) for place, _ in points]
+    values = [float(value) for _, value in points]
+    return float(np.interp(progress, places, values))
+
+
+def set_noise(agent, args, progress):
+    """Set the log-std where it is not learned; returns the learning rate of this update.
+
+    Two Gaussians of one std whose means differ by d have a KL divergence of d^2 / (2 std^2). The less noise, the
+    further an optimiser's step of fixed size moves the policy. With a rate in proportion to the std it moves it equally
+    far at any noise, so that the noise can fall by a factor of hundreds and the policy still learns.
+    """
+    if agent.actor_logstd.requires_grad:
+        agent.actor_logstd.data.clamp_(*LOG_STD_RANGE)  # beyond it get_policy's clamp leaves no gradient
+    else:
+        agent.actor_logstd.data.fill_(at(args.log_std, progress))
+    learning_rate = at(args.learning_rate, progress)
+    if args.lr_times_std:
+        learning_rate *= agent.actor_logstd.exp().mean().item()
+    return learning_rate
+
+
+def linear_fit(x, y, alive):
+    """Ridge regression of y (..., G) on x (..., G, k) over the G episodes of a group that live: the fitted y.
+
+    Each episode is in its own fit. This shrinks its residual by the factor 1 - l, where l is its leverage. l depends
+    on the states at this step, not on the action: a state's gradient keeps its direction, and extreme states count
+    less. (A fit without it was worse: docs/training-notes.md.)
+    """
+    x, y = x.double(), y.double()[..., None]
+    weight = alive.double()[..., None]  # (..., G, 1)
+    count = weight.sum(-2, keepdim=True).clamp(min=1)  # (..., 1, 1)
+    y_mean = (y * weight).sum(-2, keepdim=True) / count
+    x = (x - (x * weight).sum(-2, keepdim=True) / count) * weight  # centred
+    x = x / ((x * x).sum(-2, keepdim=True) / count).sqrt().add(1e-6)  # of unit spread
+    ridge = 0.01 * count * torch.eye(x.shape[-1]).to(x)  # what all episodes share has no slope
+    slope = torch.linalg.solve(x.mT @ x + ridge, x.mT @ (y - y_mean))
+    fitted = y_mean + x @ slope  # (..., G, 1)
+    return fitted[..., 0].to(alive.dtype)
+
+
+def returns_baseline(batch, gamma, group):
+    """b (T, N) and c (T, 1) of the value V(s, t) = b + c critic(s, t); with group 1 the paper's, b = 0 and c = 1.
+
+    Each `group` of episodes that follow one another flew the same start. b regresses their returns from step t on
+    linearly on the states that they have reached by then, c is the spread of what is left. With small noise a critic's
+    error is larger than what an action changes; comparing flights of one start shows what an action changes.
+
+    Relatives: the mean return of other samples of the same question as the baseline (RLOO, Kool et al. 2019), or of the
+    whole group, in units of its spread (GRPO, Shao et al. 2024). They have one return a sample, we one a step; hence
+    the regression on the state, a linear control variate.
+    """
+    if group == 1:
+        return torch.zeros_like(batch.rewards), torch.ones_like(batch.rewards[:, :1])
+    no_values = torch.zeros_like(batch.values)
+    returns, _ = gae(batch.rewards, no_values, batch.alive, gamma, 1.0)  # Monte-Carlo
+    obs = batch.obs.unflatten(1, (-1, group))
+    grouped_returns = returns.unflatten(1, (-1, group))
+    alive = batch.alive.unflatten(1, (-1, group))
+    baseline = linear_fit(obs, grouped_returns, alive).flatten(1)
+    _, variance = moments(returns - baseline, batch.alive, 1)
+    floor = 0.3 * variance.sqrt().mean()  # for steps of next to no spread; steps after every end count as zeros
+    return baseline, (variance + floor**2 + 1e-8).sqrt()
+
+
 # Shared: training (Algorithm 1) and main ------------------------------------------------------------------------------
-def linear_schedule(first, last, progress):
-    """`first` in the first update (progress 0), `last` in the last one (progress 1), linear in between."""
-    return first + (last - first) * progress
-
-
-def begin_refinement(agent, args):
-    """From here on the noise is set, not learned; where starts are flown in groups, V begins anew as their baseline."""
-    if args.log_std_refine is not None:
-        nn.init.constant_(agent.actor_logstd, args.log_std_refine)
-    if args.flights_per_start > 1:
-        for parameter in agent.critic[-1].parameters():
-            nn.init.zeros_(parameter)
-
-
 def train(args, agent, average, optimizer, envs, run):
     """Algorithm 1, its lines beside ours. `run` counts, logs, saves and evaluates; it changes nothing that is learned.
 
     Raises FloatingPointError, before the optimiser moves the weights, when a loss or the gradient is not finite.
     """
-    last = max(args.total_updates - 1, 1)
     target_kl = math.inf if args.target_kl is None else args.target_kl
-    refine_from = math.inf if args.refine_from is None else args.refine_from
     for iteration in range(run.updates_done + 1, args.total_updates + 1):  # line 2
-        progress = (iteration - 1) / last
-        progress_before = (iteration - 2) / last
-        refines = refine_from <= progress
-        if progress_before < refine_from <= progress:
-            begin_refinement(agent, args)
-        agent.actor_logstd.requires_grad_(args.noise == "learned" and not refines)
-        std = agent.actor_logstd.exp().mean().item()
-        learning_rate = linear_schedule(args.learning_rate, args.learning_rate_final, progress)
-        if args.lr_schedule == "std":
-            learning_rate = args.learning_rate * std
+        progress = (iteration - 1) / max(args.total_updates - 1, 1)
+        memory_noise = at(args.memory_noise, progress)
+        gae_lambda = at(args.gae_lambda, progress)
+        ent_coef = at(args.ent_coef, progress)
+        learning_rate = set_noise(agent, args, progress)
         optimizer.param_groups[0]["lr"] = learning_rate
-        ent_coef = linear_schedule(args.ent_coef, args.ent_coef_final, progress)
-        gae_lambda = linear_schedule(args.gae_lambda, args.gae_lambda_final, progress)  # None: by now --gae-lambda
-        memory_noise = linear_schedule(args.memory_noise, args.memory_noise_final, progress)
-        group = set_curriculum(envs, args, progress, refines, std)
+        group = set_curriculum(envs, args, progress)
 
         # lines 3-13: fly one episode in every environment
         batch, episodes = rollout(agent, envs, args.reward_scale, memory_noise)
@@ -677,25 +788,19 @@ def train(args, agent, average, optimizer, envs, run):
         means["explained_variance"] = explained_variance(batch.values, batch.returns, batch.alive)
         means["baseline_explained_variance"] = explained_variance(baseline, returns, batch.alive)
 
-        update_running_statistics(agent, average.module, args, batch)
-
-        # the noise of the next update: an equal step of what is left to --log-std-final
-        if args.noise == "schedule" or refines:
-            updates_left = max(args.total_updates - iteration, 1)
-            agent.actor_logstd.data += (args.log_std_final - agent.actor_logstd.data) / updates_left
-        agent.actor_logstd.data.clamp_(*LOG_STD_RANGE)  # beyond it get_policy's clamp leaves no gradient
         run.end_update(iteration, batch.alive, episodes, means, learning_rate)
 
 
 def main(argv):
-    args, saved = runs.parse_args(Args, argv, ENV_OPTIONS, BUFFERS)
+    args, saved = runs.parse_args(Args, recipe, argv, ENV_OPTIONS, BUFFERS)
     device = runs.prepare_torch(args)
-    env_options = {name: getattr(args, name) for name in ENV_OPTIONS}
+    env_options = {name: getattr(args, name) for name in ENV_OPTIONS} | FIXED_OPTIONS
     envs = runs.make_envs(args, env_options)
     agent = Agent(args, envs).to(device)
     runs.load_checkpoint(agent, args, saved)
+    prepare(agent, args, env_options)
     average = AveragedModel(agent, multi_avg_fn=get_ema_multi_avg_fn(args.weight_average))
-    optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
+    optimizer = torch.optim.Adam(agent.parameters(), eps=1e-5, fused=True)  # train sets its learning rate
     run = runs.Run(
         args=args,
         saved=saved,

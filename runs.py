@@ -9,19 +9,21 @@ import contextlib
 import copy
 import ctypes
 import gc
+import hashlib
 import importlib.util
 import io
 import json
 import math
 import os
+import re
 import signal
 import sys
 import time
 import zipfile
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from itertools import takewhile
 from pathlib import Path
-from typing import Any, NoReturn, get_type_hints
+from typing import Annotated, Any, NoReturn, get_type_hints
 
 import gymnasium as gym
 import safetensors.torch
@@ -43,21 +45,39 @@ gc.freeze()  # what was imported is never garbage; looking through it took a fif
 # Arguments
 # ---------------------------------------------------------------------------------------------------------------------
 
+
+def schedule_of(words):
+    """A flag's words: one number, or points "0:-1 0.4:-2 1:-6" over the training. ValueError where they are neither."""
+    if len(words) > 1 or ":" in "".join(words):
+        return " ".join(words)
+    if not words:
+        raise ValueError("must be a number, or points as 0:-1 0.4:-2 1:-6")
+    word = words[0]
+    return int(word) if word.isdigit() else float(word)
+
+
+Schedule = Annotated[
+    float | int | str,
+    tyro.constructors.PrimitiveConstructorSpec(
+        nargs="*",
+        metavar="VALUE | PLACE:VALUE ...",
+        instance_from_str=schedule_of,
+        is_instance=lambda value: isinstance(value, float | int | str),
+        str_from_instance=lambda value: str(value).split(),
+    ),
+]
 RANGES = {  # lowest and highest value of every numeric flag; NaN and infinity are outside
     **dict.fromkeys(["seed", "eval_seed", "num_threads", "eval_every"], (0, 2**31 - 1)),
-    **dict.fromkeys(["total_updates", "num_envs", "num_minibatches", "update_epochs", "radius_curriculum"], (1, 10**6)),
+    **dict.fromkeys(["total_updates", "num_envs", "num_minibatches", "update_epochs"], (1, 10**6)),
     **dict.fromkeys(["embed_dim", "num_heads", "mlp_dim", "hidden_dim"], (1, 8192)),
-    **dict.fromkeys(["learning_rate", "learning_rate_final", "clip_coef"], (0.0, 1.0)),
-    **dict.fromkeys(["gamma", "gae_lambda", "gae_lambda_final", "refine_from"], (0.0, 1.0)),
-    **dict.fromkeys(["memory_noise", "memory_noise_final"], (0.0, 1.0)),
-    **dict.fromkeys(["ent_coef", "ent_coef_final", "vf_coef", "mass_weight"], (0.0, 1e3)),
+    **dict.fromkeys(["learning_rate", "clip_coef", "gamma", "gae_lambda", "memory_noise"], (0.0, 1.0)),
+    **dict.fromkeys(["ent_coef", "vf_coef", "mass_weight"], (0.0, 1e3)),
     **dict.fromkeys(["reward_scale", "max_grad_norm", "target_kl"], (1e-9, 1e9)),
-    **dict.fromkeys(["log_std", "log_std_refine", "log_std_final"], (-8.0, 0.5)),
+    **{"log_std": (-8.0, 0.5), "log_radius": (-5.0, 14.0)},
     **{"eval_starts": (10, 10**6), "num_blocks": (0, 64), "memory_length": (0, 8192)},
     **{"flights_per_start": (1, 10**6), "dispersion": (0.0, 10.0), "weight_average": (0.0, 0.99999)},
 }
-CHOICES = {"action_frame": ("local", "eci"), "guidance": ("auto", "none", "linear", "knots")}
-CHOICES |= {"noise": ("learned", "schedule"), "lr_schedule": ("linear", "std")}
+CHOICES = {"recipe": ("ours", "paper")}
 NETWORK = ("num_blocks", "embed_dim", "num_heads", "memory_length", "mlp_dim", "hidden_dim")
 NOT_OF_A_CHECKPOINT = {"dispersion"}  # options of the environment that are chosen anew for every run and evaluation
 MAY_CHANGE_ON_RESUME = {"resume", "cuda", "num_threads"}
@@ -74,15 +94,15 @@ def refuse(name, value, allowed) -> NoReturn:
     fail(f"{flag}: {allowed}")
 
 
-def read_flags(kind, argv):
-    """The dataclass `kind` that a command line describes, and the set of fields that it names.
+def read_flags(defaults, argv):
+    """The dataclass that a command line describes, and the set of fields that it names; `defaults` has the others.
 
     tyro alone knows which flags there are and what they take, but neither which of them were typed nor how to complain
     in one line: the names are read from `argv`, and of its framed message the first paragraph is shown.
     """
     with contextlib.redirect_stderr(io.StringIO()) as frame:
         try:
-            args = tyro.cli(kind, args=argv, description=allowed(kind))
+            args = tyro.cli(type(defaults), args=argv, default=defaults, description=allowed(defaults))
         except SystemExit as stop:
             if not stop.code:  # --help
                 raise
@@ -93,32 +113,35 @@ def read_flags(kind, argv):
     return args, {word.removeprefix("--").replace("-", "_").removeprefix("no_") for word in words}
 
 
-def allowed(kind):
-    """What --help says of the numbers: each flag of `kind` with its range."""
-    ranges = {name: bounds for name, bounds in RANGES.items() if hasattr(kind, name)}
+def allowed(args):
+    """What --help says of the numbers: each flag with its range."""
+    ranges = {name: bounds for name, bounds in RANGES.items() if hasattr(args, name)}
     flags = (f"--{name.replace('_', '-')} {low:g} to {high:g}" for name, (low, high) in ranges.items())
     return f"Ranges: {', '.join(flags)}"
 
 
-def parse_args(kind, argv, env_options, buffers):
-    """A script's checked arguments; with --resume the saved training state, with --checkpoint what that file holds.
+def parse_args(kind, recipe, argv, env_options, buffers):
+    """A script's checked arguments; with --resume the saved training state, with a checkpoint what that file holds.
 
-    kind is the script's Args, env_options the arguments that go to its environments, buffers what its agents hold by
-    environment id. SystemExit with one line that names the flag, the value and what is allowed.
+    kind is the script's Args, `recipe(args)` what its recipe changes for these environments, env_options the arguments
+    that go to its environments, buffers what its agents hold by environment id. What was typed wins over what a
+    checkpoint decides, that over the recipe, and that over Args. SystemExit with one line that names the flag, the
+    value and what is allowed.
     """
-    args, typed = read_flags(kind, argv)
-    saved, env_ids = None, tuple(buffers)
-    if args.resume is not None:
+    asks_for_help = not {"-h", "--help"}.isdisjoint(argv)
+    typed_args, typed = read_flags(kind(), [word for word in argv if word not in ("-h", "--help")])
+    env_ids = tuple(buffers)
+    if typed_args.resume is not None and not asks_for_help:
         refused = sorted(typed - MAY_CHANGE_ON_RESUME)
         if refused:
             refuse(refused[0], "", "only --cuda and --num-threads may be given beside --resume")
-        saved = load_state(args.resume, kind, env_ids)
-        args = kind(**{**saved["args"], **{name: getattr(args, name) for name in typed}})
-    elif args.checkpoint is not None:
-        saved = take_checkpoint_args(args, kind, typed, env_options, buffers)
-    elif args.eval_only:
-        refuse("checkpoint", None, "must name the agent.safetensors that --eval-only flies")
-    check(args, typed, env_ids)
+        saved = load_state(typed_args.resume, kind, env_ids)
+        args = kind(**{**saved["args"], **{name: getattr(typed_args, name) for name in typed}})
+        defaults = args
+    else:
+        defaults, saved = resolve(typed_args, typed, kind, recipe, env_options, buffers)
+        args, _ = read_flags(defaults, argv)
+    check(args, env_ids)
     check_buffers(args, buffers[args.env_id])
     task = task_of(args.env_id)
     if unfit := task.refusal(not args.eval_only, **options_of(args, env_options)):
@@ -128,10 +151,36 @@ def parse_args(kind, argv, env_options, buffers):
     if args.eval_only and saved and saved["progress"]["seed"] == args.eval_seed:
         if remark := task.remark_on_seed(args.eval_seed):
             print(remark)
-    fill_last_values(args)
     if args.eval_starts is None:
-        args.eval_starts = task.default_flights(not args.eval_only, **options_of(args, env_options))
+        is_cut_short = not args.eval_only and args.total_updates < defaults.total_updates
+        args.eval_starts = task.default_flights(is_cut_short, **options_of(args, env_options))
     return args, saved
+
+
+def resolve(args, typed, kind, recipe, env_options, buffers):
+    """Args with all that was not typed as the checkpoint and the recipe have it; and what the checkpoint holds."""
+    saved = None
+    decided = {}
+    if args.checkpoint is not None:
+        saved, decided = take_checkpoint_args(args, kind, typed, env_options, buffers)
+    elif args.eval_only:
+        refuse("checkpoint", None, "must name the agent.safetensors that --eval-only flies")
+    check_values(args, tuple(buffers))
+    changes = recipe(args) if args.recipe == "ours" else {}
+    if args.checkpoint is None and "checkpoint" in changes:
+        first = changes["checkpoint"]
+        if not Path(first).is_file():
+            todo = "run this in the repository's folder, or train that policy first and name it by --checkpoint"
+            fail(f"the recipe begins with the policy {first}, which is not there: {todo}")
+        _, its_own = read_policy(first, kind, env_options, buffers)
+        differing = contradictions(args, typed, its_own)
+        if differing:
+            flag = f"--{differing[0].replace('_', '-')} {getattr(args, differing[0])}"
+            print(f"{flag}: the recipe's first policy, {first}, has another; this training begins anew")
+        else:
+            args.checkpoint = first
+            saved, decided = take_checkpoint_args(args, kind, typed, env_options, buffers)
+    return replace(kind(), **{**changes, **decided, "checkpoint": args.checkpoint}), saved
 
 
 def options_of(args, env_options):
@@ -139,54 +188,86 @@ def options_of(args, env_options):
     return {name: getattr(args, name) for name in env_options}
 
 
-def fill_last_values(args):
-    """A last value that is not given is the first."""
-    for name in ("gae_lambda", "memory_noise"):
-        if getattr(args, f"{name}_final") is None:
-            setattr(args, f"{name}_final", getattr(args, name))
+def read_policy(path, kind, env_options, buffers):
+    """What an agent.safetensors holds, and the arguments that it decides. BadInput where it is damaged or foreign."""
+    options = [name for name in env_options if name not in NOT_OF_A_CHECKPOINT]
+    names = ("env_id", *options, *NETWORK)
+    kinds = {name: type(getattr(kind, name)) for name in names}
+    younger = {name: getattr(kind, name) for name in options}  # perhaps than the file
+    saved = read_checkpoint(path, kinds, tuple(buffers), younger)
+    return saved, {name: saved["args"][name] for name in names}
+
+
+def contradictions(args, typed, decided):
+    """The fields that were typed and are not as a checkpoint decides them."""
+    return [name for name, value in decided.items() if name in typed and getattr(args, name) != value]
 
 
 def take_checkpoint_args(args, kind, typed, env_options, buffers):
-    """What the file --checkpoint holds; sets the arguments that it decides, and refuses flags that contradict it.
+    """What the file --checkpoint holds, and the arguments that it decides; sets these, refuses flags that contradict.
 
-    Its environment may be another with the same buffers, and its noise is gone on with, unless a flag says otherwise.
+    Its environment may be another with the same buffers. A noise that is learned goes on from the file's, unless a flag
+    says otherwise.
     """
-    options = [name for name in env_options if name not in NOT_OF_A_CHECKPOINT]
-    decided = {name: type(getattr(kind, name)) for name in ("env_id", *options, *NETWORK)}
-    defaults = {name: getattr(kind, name) for name in options}  # of options that are younger than the file
-    saved = read_checkpoint(args.checkpoint, decided, tuple(buffers), defaults)
-    for name in decided:
-        value, given = saved["args"][name], getattr(args, name)
-        if name == "env_id" and name in typed and value != given and buffers.get(value) == buffers.get(given):
+    saved, decided = read_policy(args.checkpoint, kind, env_options, buffers)
+    for name in contradictions(args, typed, decided):
+        value, given = decided[name], getattr(args, name)
+        if name == "env_id" and buffers.get(value) == buffers.get(given):
             print(f"--checkpoint is of {value}; it goes on with {given}")
-        elif name in typed and value != given:
-            refuse(name, given, f"the checkpoint has {value}; leave the flag out")
+            decided[name] = given
         else:
-            setattr(args, name, value)
+            refuse(name, given, f"the checkpoint has {value}; leave the flag out")
+    for name, value in decided.items():
+        setattr(args, name, value)
     saved["keeps_log_std"] = "log_std" not in typed
-    return saved
+    return saved, decided
 
 
-def check(args, typed, env_ids):
+def check_values(args, env_ids):
+    """Refuse a number out of its range, and a word that is not among those of its flag."""
+    for name, choices in {"env_id": env_ids, **CHOICES}.items():
+        value = getattr(args, name)
+        if value not in choices:
+            refuse(name, value, f"must be one of {', '.join(choices)}")
+    kinds = get_type_hints(type(args), include_extras=True)
+    for name, value in vars(args).items():
+        if name not in RANGES or value is None:
+            continue
+        low, high = RANGES[name]
+        values = schedule_values(name, value) if kinds[name] == Schedule else [value]
+        if not all(low <= number <= high for number in values):
+            refuse(name, value, f"must be between {low} and {high}")
+    if not all(number.is_integer() for number in schedule_values("flights_per_start", args.flights_per_start)):
+        refuse("flights_per_start", args.flights_per_start, "must be whole numbers")
+
+
+def check(args, env_ids):
     """Refuse what no run can use: SystemExit with one line that names the flag, the value and what is allowed.
 
-    args is a script's Args, typed the set of fields that the user gave, env_ids the script's environments.
+    args is a script's Args, env_ids the script's environments.
     """
-    choices = {"env_id": env_ids, **CHOICES}
-    for name, value in vars(args).items():
-        if name in RANGES and value is not None and not RANGES[name][0] <= value <= RANGES[name][1]:
-            refuse(name, value, f"must be between {RANGES[name][0]} and {RANGES[name][1]}")
-        if name in choices and value not in choices[name]:
-            refuse(name, value, f"must be one of {', '.join(choices[name])}")
+    check_values(args, env_ids)
     if args.embed_dim % args.num_heads:
         refuse("num_heads", args.num_heads, f"must divide --embed-dim {args.embed_dim}")
-    if args.flights_per_start > 1 and args.refine_from is None and type(args)().flights_per_start == 1:
-        print(f"--flights-per-start {args.flights_per_start}: of the refinement alone, which --refine-from begins")
     check_outputs(args)
     if Path(args.exp_name).name != args.exp_name:
         refuse("exp_name", args.exp_name, "must be the name of a folder, without /")
     if args.track and importlib.util.find_spec("wandb") is None:
         refuse("track", "", "needs wandb: pip install wandb")
+
+
+def schedule_values(name, schedule):
+    """The numbers that a schedule goes through; one line if it is none."""
+    if not isinstance(schedule, str):
+        return [float(schedule)]
+    try:
+        points = [[float(word) for word in point.split(":")] for point in schedule.split()]
+        places, values = zip(*points)
+        if list(places) != sorted(places) or not all(0 <= place <= 1 for place in places):
+            raise ValueError
+    except ValueError:
+        refuse(name, schedule, "must be a number, or points as 0:-1 0.4:-2 1:-6 whose places rise from 0 to 1")
+    return values
 
 
 def check_outputs(args):
@@ -242,12 +323,19 @@ def check_share(args, typed):
         print(f"--num-minibatches lowered from {args.num_minibatches} to {total_envs}")
         args.num_minibatches = smallest
 
-    group = largest_group(args.flights_per_start, {smallest, largest})
-    if group < args.flights_per_start:
+    shares = {smallest, largest}
+    groups = {int(group) for group in schedule_values("flights_per_start", args.flights_per_start)}
+    for group in groups:
+        fits = largest_group(group, shares)
+        if fits == group:
+            continue
         if "flights_per_start" in typed:
             refuse("flights_per_start", args.flights_per_start, f"must divide {total_envs}")
-        print(f"--flights-per-start lowered from {args.flights_per_start} to {group}, which divides {total_envs}")
-        args.flights_per_start = group
+        print(f"--flights-per-start lowered from {group} to {fits}, which divides {total_envs}")
+        if isinstance(args.flights_per_start, str):
+            args.flights_per_start = re.sub(rf":{group}\b", f":{fits}", args.flights_per_start)
+        else:
+            args.flights_per_start = fits
 
 
 def largest_group(most, shares):
@@ -312,7 +400,8 @@ def load_checkpoint(agent, args, saved):
         name = differing[0]
         theirs, here = (shape.get(name, "missing") for shape in (shapes, expected))
         why = f"{name} is {theirs} in the file and {here} in this script"
-        fail(f"--checkpoint {args.checkpoint}: does not fit its own args, BUFFERS or features ({why})")
+        todo = "train it anew, or fly it by the version that trained it (CHANGELOG.md)"
+        fail(f"--checkpoint {args.checkpoint}: does not fit its own args, BUFFERS or features ({why}); {todo}")
     for name, constant in ours.items():
         learnt = not constant.any()  # zeros in a new agent
         if not learnt and not torch.allclose(constant.cpu(), torch.from_numpy(saved["tensors"][name]), rtol=1e-6):
@@ -322,8 +411,10 @@ def load_checkpoint(agent, args, saved):
         agent.load_state_dict({name: torch.from_numpy(array) for name, array in saved["tensors"].items()})
     except (RuntimeError, TypeError) as error:  # a type that torch does not have
         fail(f"--checkpoint {args.checkpoint}: its weights do not fit its own args ({error})")
-    if not saved["keeps_log_std"]:
-        torch.nn.init.constant_(agent.actor_logstd, args.log_std)
+    if agent.actor_logstd.requires_grad and not saved["keeps_log_std"]:
+        torch.nn.init.constant_(agent.actor_logstd, float(args.log_std))
+    if not args.eval_only:
+        print(f"begins with {args.checkpoint}, sha256 {hashlib.sha256(Path(args.checkpoint).read_bytes()).hexdigest()}")
 
 
 def refuse_nan(values, epoch, minibatch):
@@ -395,7 +486,8 @@ class Run:
 
     def solve_reference(self):
         """The optima that evaluations fly, before anything is learned: one that does not exist is said at once."""
-        seeds = [TRAINING_EVAL_SEED] * (self.args.eval_every > 0) + [self.args.eval_seed]
+        evaluates_on_the_way = 0 < self.args.eval_every <= self.args.total_updates
+        seeds = [TRAINING_EVAL_SEED] * evaluates_on_the_way + [self.args.eval_seed]
         for seed in seeds:
             self.task.optimum(seed, self.flights(seed), **self.env_options)
 

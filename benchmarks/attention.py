@@ -38,9 +38,9 @@ def load(checkpoint):
     env_id = read_checkpoint(checkpoint, {})["args"]["env_id"]
     (script,) = (script for script in SCRIPTS if env_id in script.ENV_IDS)
     argv = ["--eval-only", "--checkpoint", str(checkpoint)]
-    args, saved = runs.parse_args(script.Args, argv, script.ENV_OPTIONS, script.BUFFERS)
+    args, saved = runs.parse_args(script.Args, script.recipe, argv, script.ENV_OPTIONS, script.BUFFERS)
     args.dispersion = saved["args"].get("dispersion", 0.0)
-    options = {name: getattr(args, name) for name in script.ENV_OPTIONS}
+    options = {name: getattr(args, name) for name in script.ENV_OPTIONS} | script.FIXED_OPTIONS
     agent = script.Agent(args, gym.make_vec(env_id, num_envs=1, **options))
     runs.load_checkpoint(agent, args, saved)
     return agent, args, options

@@ -8,7 +8,6 @@ from pathlib import Path
 from unittest import mock
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-import runs  # noqa: E402
 
 
 class UpdateDone(Exception):
@@ -24,13 +23,6 @@ class OneUpdate:
     def end_update(self, iteration, alive, episodes, losses, learning_rate):
         self.losses = losses
         raise UpdateDone
-
-
-def script_args(script, **changes):
-    """A script's Args as `runs.parse_args` leaves them: a last value that is not given is the first."""
-    args = script.Args(**changes)
-    runs.fill_last_values(args)
-    return args
 
 
 def one_update(script, args, modules, envs, batch, iteration=1, group=None):

@@ -164,7 +164,7 @@ def random_arguments(rng, script):
 
 def parse_args(script, argv):
     """The script's arguments and what it starts from."""
-    return runs.parse_args(script.Args, argv, script.ENV_OPTIONS, script.BUFFERS)
+    return runs.parse_args(script.Args, script.recipe, argv, script.ENV_OPTIONS, script.BUFFERS)
 
 
 def fuzz_arguments(count, seed=0):

@@ -132,7 +132,7 @@ def read_job(words):
     kind = importlib.import_module(Path(script).stem)
     if {"--help", "-h"} & set(flags):
         raise ValueError("--help trains nothing")
-    args, _ = runs.parse_args(kind.Args, flags, kind.ENV_OPTIONS, kind.BUFFERS)
+    args, _ = runs.parse_args(kind.Args, kind.recipe, flags, kind.ENV_OPTIONS, kind.BUFFERS)
     if args.eval_only or not args.save_model:
         raise ValueError(f"{'--eval-only' if args.eval_only else '--no-save-model'} leaves no run to publish")
     return Job(Path(results), [script, *flags], asdict(args))

@@ -6,7 +6,7 @@
     python benchmarks/sb3_ppo.py --env-id RocketAscentCutoff-v0 --recurrent --dispersion 1 --start RUN.zip
 
 It is given what our script gives its own learner: the curriculum (scale of R_terminal), the first mean action and its
-noise, the local frame, and our features of the observation (of dispersed flights beside their mean, too), or with
+noise, the local frame, and our features of the observation (of dispersed flights beside the nominal one, too), or with
 --features raw the observation itself; propellant has a price by the kilogram. The rest is that library's: feed-forward
 networks for actor and critic (an LSTM with --recurrent, of sb3-contrib), VecNormalize of inputs and rewards, its
 discount, clipping and epochs. `peers.py` runs and lists all.
@@ -80,9 +80,9 @@ class OurCurriculum(BaseCallback):
         self.script, self.args, self.batch, self.samples = script, args, batch, samples
 
     def _on_rollout_start(self):
-        std = self.model.policy.log_std.exp().mean().item()
         progress = self.num_timesteps / self.samples
-        self.script.set_curriculum(self.batch, self.args, progress, False, std)
+        self.args.log_std = self.model.policy.log_std.mean().item()  # as it was learned
+        self.script.set_curriculum(self.batch, self.args, progress)
         if hasattr(self.args, "mass_weight"):
             price = np.interp(progress, [0.25, 0.6, 1.0], [0.0, 1.0, 0.1])
             self.batch.mass_weight = float(self.batch.cutoff * self.args.mass_weight * price)
@@ -92,45 +92,25 @@ class OurCurriculum(BaseCallback):
         return True
 
 
-class OurMeanFlight(BaseCallback):
-    """After each rollout, what our script learns after each update: the mean of the dispersed flights, step by step.
+class OurNominalFlight(BaseCallback):
+    """When a dispersed training begins, what our script does then: the nominal flight is flown, and kept."""
 
-    A rollout is as long as a flight but begins in the middle of some: its observations are sorted by the step of their
-    flight. Of two flights of one environment that come to the same step, the later counts.
-    """
-
-    def __init__(self, script, args, seen):
+    def __init__(self, script, env_id, env_options, seen):
         super().__init__()
-        self.script, self.args, self.seen, self.constants = script, args, seen, seen.constants
-        self.new = len(script.DIFFERENCES)  # features that were all zero until there is a mean
-        self.constants.encoder = [SimpleNamespace(weight=torch.zeros(1, self.new))]  # ours; theirs is cleared below
+        self.script, self.seen = script, seen
+        self.nominal = gym.make_vec(env_id, num_envs=1, **{**env_options, "dispersion": 0.0})
+        self.new = len(script.DIFFERENCES)  # features that were all zero until there is a flight
 
     def _on_training_start(self):
-        # a part of VecNormalize, so that --save and --start keep it
-        self.constants.mean_flight = vars(self.training_env).setdefault("mean_flight", self.constants.mean_flight)
-        self.step = np.zeros(self.training_env.num_envs, dtype=int)
-
-    def _on_rollout_start(self):
-        shape = len(self.constants.mean_flight), self.training_env.num_envs
-        self.obs = np.repeat(self.seen.raw[None], shape[0], axis=0)  # a step that nobody flies needs a real state
-        self.alive = np.zeros(shape, dtype=np.float32)
-        self._keep()
+        kept = vars(self.training_env)  # a part of VecNormalize, so that --save and --start keep it
+        if "nominal_flight" not in kept:
+            self.script.fly_nominal(self.seen.constants, make_policy(self.model, self.training_env), self.nominal)
+            kept["nominal_flight"] = self.seen.constants.nominal_flight
+            self._come_into_sight()
+        self.seen.constants.nominal_flight = kept["nominal_flight"]
 
     def _on_step(self):
-        self.step = np.where(self.locals["dones"], 0, self.step + 1)
-        self._keep()
         return True
-
-    def _keep(self):
-        flying = np.flatnonzero(self.step < len(self.obs))
-        self.obs[self.step[flying], flying] = self.seen.raw[flying]
-        self.alive[self.step[flying], flying] = 1.0
-
-    def _on_rollout_end(self):
-        if not self.constants.mean_flight.any():
-            self._come_into_sight()
-        batch = SimpleNamespace(obs=torch.as_tensor(self.obs), alive=torch.as_tensor(self.alive))
-        self.script.update_running_statistics(self.constants, self.constants, self.args, batch)
 
     @torch.no_grad()
     def _come_into_sight(self):
@@ -291,10 +271,11 @@ def main():
     code = {"commit": commit(), "flags": shlex.join(sys.argv[1:])}  # now: hours later it may be another
     torch.set_num_threads(1)
     script = script_of(options.env_id)
-    args = script.Args(env_id=options.env_id)
+    args = script.Args(**{**script.recipe(script.Args(env_id=options.env_id)), "env_id": options.env_id})
+    args.log_std, args.flights_per_start = script.Args().log_std, 1  # the library learns its noise
     given = {name: getattr(options, name) for name in ("dispersion", "mass_weight", "log_std")}
     vars(args).update({name: value for name, value in given.items() if value is not None})
-    env_options = {name: getattr(args, name) for name in script.ENV_OPTIONS}
+    env_options = {name: getattr(args, name) for name in script.ENV_OPTIONS} | script.FIXED_OPTIONS
 
     batch = gym.make_vec(options.env_id, num_envs=options.num_envs, **env_options).unwrapped
     venv = VecMonitor(NativeVecEnv(batch))
@@ -309,7 +290,7 @@ def main():
     evaluation = Evaluation(options.env_id, env_options, options.samples)
     callbacks = [OurCurriculum(script, args, batch, options.samples), evaluation]
     if options.dispersion and options.features == "ours":
-        callbacks.append(OurMeanFlight(script, args, venv))
+        callbacks.append(OurNominalFlight(script, options.env_id, env_options, venv))
     model.learn(options.samples, callback=callbacks)
     print(task_of(options.env_id).table(evaluation.metrics))
     if options.save:

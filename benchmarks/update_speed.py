@@ -34,18 +34,21 @@ from torch.utils.flop_counter import FlopCounterMode
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from one_update import one_update, script_args  # noqa: E402
+from one_update import one_update  # noqa: E402
 
+import ppo_gtrxl_rocket  # noqa: E402
 from drawing.style import save_figures  # noqa: E402
 from runs import keep_memory  # noqa: E402
 
-PAPER = {"num_blocks": 6, "embed_dim": 384, "num_heads": 8, "memory_length": 256, "mlp_dim": 384, "hidden_dim": 384}
-PAPER |= {"update_epochs": 16, "num_envs": 8, "num_minibatches": 1, "flights_per_start": 1}
-SIZES = {"di": ("ppo_gtrxl_di", {}), "vdp": ("ppo_gtrxl_vdp", {}), "rocket": ("ppo_gtrxl_rocket", {})}
-SIZES["table1"] = ("ppo_gtrxl_rocket", PAPER)
+SIZES = {  # by Table 1, but for our rocket
+    "di": ("ppo_gtrxl_di", {}),
+    "vdp": ("ppo_gtrxl_vdp", {}),
+    "rocket": ("ppo_gtrxl_rocket", ppo_gtrxl_rocket.RECIPES["RocketAscent-v0"]),
+    "table1": ("ppo_gtrxl_rocket", {"num_envs": 8, "num_minibatches": 1}),
+}
 GATHERED_SAMPLES = {"table1": 64}  # of a minibatch, where a whole one would need more memory than there is
-# every minibatch takes its step, with a learning rate of 0, and the noise stays: each epoch finds the same weights
-STILL = {"target_kl": None, "lr_schedule": "linear", "learning_rate": 0.0, "learning_rate_final": 0.0}
+# every minibatch takes its step, with a learning rate of 0: each epoch finds the same weights
+STILL = {"target_kl": None, "learning_rate": 0.0}
 
 
 def timed(function):
@@ -72,20 +75,19 @@ class Workbench:
     def __init__(self, script, **changes):
         self.script = importlib.import_module(script)
         self.epochs = changes.get("update_epochs", self.script.Args().update_epochs)
-        self.args = args = script_args(self.script, **{**changes, **STILL, "update_epochs": 1})
-        args.flights_per_start = min(args.flights_per_start, args.num_envs)
-        args.log_std_final = args.log_std
+        self.args = args = self.script.Args(**{**changes, **STILL, "update_epochs": 1})
         torch.manual_seed(args.seed)
-        options = {name: getattr(args, name) for name in self.script.ENV_OPTIONS}
+        options = {name: getattr(args, name) for name in self.script.ENV_OPTIONS} | self.script.FIXED_OPTIONS
         self.envs = gym.make_vec(args.env_id, num_envs=args.num_envs, **options)
         self.envs.reset(seed=args.seed)
         self.agent = self.script.Agent(args, self.envs)
         self.average = AveragedModel(self.agent, multi_avg_fn=get_ema_multi_avg_fn(args.weight_average))
-        self.optimizer = torch.optim.Adam(self.agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
+        self.optimizer = torch.optim.Adam(self.agent.parameters(), eps=1e-5, fused=True)
 
     def rollout(self):
         args = self.args
-        batch, _ = self.script.rollout(self.agent, self.envs, args.reward_scale, args.memory_noise)
+        memory_noise = self.script.at(args.memory_noise, 0.0)
+        batch, _ = self.script.rollout(self.agent, self.envs, args.reward_scale, memory_noise)
         return batch
 
     def epoch(self, batch):
@@ -210,7 +212,10 @@ def gathered_epoch(bench, batch, samples):
         newlogprob, entropy, newvalue = agent.evaluate_actions(hidden, batch.actions[t, n])
         ratio, advantages = (newlogprob - batch.logprobs[t, n]).exp(), batch.advantages[t, n]
         clipped = ratio.clamp(1 - args.clip_coef, 1 + args.clip_coef)
-        loss = torch.max(-advantages * ratio, -advantages * clipped).mean() - args.ent_coef * entropy.mean()
+        loss = (
+            torch.max(-advantages * ratio, -advantages * clipped).mean()
+            - bench.script.at(args.ent_coef, 0.0) * entropy.mean()
+        )
         loss = loss + args.vf_coef * 0.5 * (newvalue - batch.returns[t, n]).square().mean()
         bench.optimizer.zero_grad()
         loss.backward()

@@ -103,7 +103,7 @@ class RocketVectorEnv(BatchedEnv):
     i_deg raan_deg argp_deg final_mass_kg final_time_s max_altitude_km` (at the steps' ends), the parts' sums,
     `episodic_return`, `points` (`precision_points`), `crashed`; with dispersion `draw` (N, k) and `dry`, out of fuel.
 
-    Attributes for training alone, to be set before a `reset`: `guidance` (a key of `REFERENCE_PITCH`),
+    Attributes for training alone, to be set before a `reset`: `guidance` (whether R_guidance is charged),
     `flights_per_start` (`BatchedEnv`; of each draw of a `reset`) and `terminal_scale`, a curriculum: the *reward* pays
     R_terminal with it, `final_info` reports it with `TERMINAL_SCALE`. Our training leaves the others as they are:
     `mass_weight` (a price per `mass_unit`), `trajectory_weight`, `guidance_weight` and `end_time` (s, at most the last
@@ -136,7 +136,7 @@ class RocketVectorEnv(BatchedEnv):
         self._last_phase = len(self.rocket.burns) - 1
         self.action_frame, self.observe_phase = action_frame, observe_phase
         self.dispersion, self.observe_draw, self.observe_mass = dispersion, observe_draw, observe_mass
-        self.mass_weight, self.trajectory_weight, self.guidance_weight, self.guidance = 0.0, 0.0, 0.1, "none"
+        self.mass_weight, self.trajectory_weight, self.guidance_weight, self.guidance = 0.0, 0.0, 0.1, False
         self.terminal_scale = TERMINAL_SCALE
         super().__init__(num_envs, 1, *self._spaces(), render_mode)
         self._build()
@@ -206,8 +206,6 @@ class RocketVectorEnv(BatchedEnv):
         if options and not (self.dispersion and options.keys() == {"draw"}):
             allowed = "the only one is 'draw'" if self.dispersion else "without dispersion a rocket has no options"
             raise BadInput(f"reset options are {options!r}; {allowed}")
-        if self.guidance not in REFERENCE_PITCH:
-            raise ValueError(f"guidance is {self.guidance!r}; it must be one of {', '.join(REFERENCE_PITCH)}")
         if not 0 < self.terminal_scale < np.inf:
             raise ValueError(f"terminal_scale is {self.terminal_scale}; it must be positive and finite")
         if self.dispersion:
@@ -434,10 +432,9 @@ class RocketVectorEnv(BatchedEnv):
         parts = np.zeros_like(self._parts)
         parts[0] = orbital_reward(self._distance, distance)
         parts[1] = trajectory_reward(self._energy, energy, phase < self._last_phase, self.trajectory_weight)
-        reference_pitch = REFERENCE_PITCH[self.guidance]
-        if reference_pitch is not None:
+        if self.guidance:
             until = self.mission.guided_until or self.rocket.burns[0].end
-            times, angles = reference_pitch
+            times, angles = REFERENCE_PITCH
             pitch = np.radians(np.interp(self.rocket.dt * t, until * np.array(times), angles, right=np.nan))
             parts[2] = guidance_reward(u, *local_frame(before, self._axes[2])[:2], pitch, self.guidance_weight)
         left = np.minimum(self.y[6] - self.vehicles.dry_mass, self.vehicles.propellant)
@@ -499,7 +496,7 @@ class RocketEnv(SingleEnv):
     mass_weight = of_batch("mass_weight", "Reward lost per `mass_unit` of propellant burnt in the last phase.")
     trajectory_weight = of_batch("trajectory_weight", "Weight of R_trajectory.")
     guidance_weight = of_batch("guidance_weight", "Weight of R_guidance.")
-    guidance = of_batch("guidance", "The reference pitch of R_guidance, a key of REFERENCE_PITCH.")
+    guidance = of_batch("guidance", "Whether R_guidance charges for leaving the reference pitch.")
     end_time = of_batch("end_time", "Seconds after which an episode ends at the latest.")
     terminal_scale = of_batch("terminal_scale", "The scale of R_terminal in the reward; reports keep TERMINAL_SCALE.")
     draw = property(

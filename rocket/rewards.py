@@ -23,11 +23,8 @@ def trajectory_reward(energy, next_energy, early, weight):
     return weight * (next_energy - energy) / 1e6 * early
 
 
-REFERENCE_PITCH = {  # degrees above the horizon over time, as a part of a mission's `guided_until`; our own guess
-    "none": None,
-    "linear": ((0.0, 1.0), (90.0, 40.0)),
-    "knots": ((0.0, 10 / 150.4, 40 / 150.4, 0.5, 1.0), (90.0, 88.0, 72.0, 55.0, 35.0)),  # s of the paper's rocket
-}
+# degrees above the horizon over time, as a part of a mission's `guided_until` (the paper's rocket: 150.4 s); our guess
+REFERENCE_PITCH = ((0.0, 10 / 150.4, 40 / 150.4, 0.5, 1.0), (90.0, 88.0, 72.0, 55.0, 35.0))
 
 
 def guidance_reward(u, up, along, pitch, weight):

@@ -110,7 +110,7 @@ class RocketTask:
 
     def refusal(self, trains: bool, dispersion: float = 0.0, observe_phase: bool = True, **env_options):
         if dispersion and trains and not observe_phase:
-            why = "not in a training with --dispersion: the mean flight is found by the time"
+            why = "not in a training with --dispersion: the nominal flight is looked up by the phase"
             return "no_observe_phase", why
         return None
 

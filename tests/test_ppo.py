@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 import torch
 from conftest import update
-from one_update import script_args
 from scipy.stats import norm
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
@@ -26,7 +25,7 @@ TINY |= {"log_std": -0.5}
 
 def make_args(**changes):
     defaults = {**TINY, "num_minibatches": 2, "update_epochs": 3, "learning_rate": 1e-3}
-    return script_args(script, **{**defaults, **changes})
+    return script.Args(**{**defaults, **changes})
 
 
 def make_agent(args, envs, dtype=torch.float64):
@@ -112,26 +111,38 @@ def test_gae_is_the_direct_sum(gamma, lam):
         np.testing.assert_allclose(returns[0], [rewards[:end, n].sum() for n, end in enumerate(lengths)], atol=1e-12)
 
 
-def test_linear_schedule():
-    assert script.linear_schedule(3e-4, 3e-5, 0.0) == 3e-4
-    assert script.linear_schedule(3e-4, 3e-5, 1.0) == pytest.approx(3e-5, rel=1e-12)
-    assert script.linear_schedule(1.0, 0.0, 0.5) == pytest.approx(0.5)
+def test_schedule_is_linear_between_its_points():
+    """Of two points at one place the second counts from there on; before the first and after the last: constant."""
+    schedule = "0.1:1 0.4:-2 0.4:8 0.9:3"
+    expected = {0.0: 1, 0.1: 1, 0.2: 0, 0.3: -1, 0.399: -1.99, 0.4: 8, 0.65: 5.5, 0.9: 3, 1.0: 3}
+    for progress, value in expected.items():
+        assert script.at(schedule, progress) == pytest.approx(value), progress
+    assert script.at("0:3e-4 1:3e-5", 0.0) == 3e-4 and script.at("0:3e-4 1:3e-5", 1.0) == 3e-5
+    assert script.at(0.7, 0.3) == 0.7
 
 
 @pytest.mark.parametrize("name, env_id, first", [
     ("ppo_gtrxl_di", "DoubleIntegratorWaypoints-v0", 12.0),
     ("ppo_gtrxl_vdp", "VanDerPolWaypoints-v0", 6.0),
 ])  # fmt: skip
-@pytest.mark.parametrize("refine_from", [None, 0.3])
-@pytest.mark.parametrize("progress, power", [(0.0, 1), (0.5, 0.5), (1.0, 0), (1.1, 0), (1.6, 0)])
-def test_radius_curriculum(name, env_id, first, refine_from, progress, power):
-    """From K to 1 until the refinement, or 60 % of the updates, geometrically: half-way in K^(1/2); 0.9 if refined."""
+def test_radius_curriculum(name, env_id, first):
+    """From about K times the radius, geometrically, to the true one; from there on a tenth less, flown in groups."""
     script, envs = importlib.import_module(name), gym.make_vec(env_id, num_envs=1)
-    until = refine_from or 0.6
-    refines = refine_from is not None and progress >= 1
-    script.set_curriculum(envs, script.Args(refine_from=refine_from), progress * until, refines, std=1.0)
-    assert envs.radius_scale == pytest.approx(0.9 if refines else first**power)
-    assert envs.bonus_width == (0.4 if refines else 0.0)
+    args = script.Args(**script.RECIPES[env_id])
+    refined = float(args.log_radius.split()[-2].split(":")[0])
+    for progress, scale in (
+        (0.0, first),
+        (refined / 2, first**0.5),
+        (0.999 * refined, 1.0),
+        (refined, 0.9),
+        (1.0, 0.9),
+    ):
+        group = script.set_curriculum(envs, args, progress)
+        assert envs.radius_scale == pytest.approx(scale, rel=0.02)
+        assert envs.bonus_width == (0.4 if progress >= refined else 0.0)
+        assert group == envs.flights_per_start == (8 if progress >= refined else 1)
+    assert script.set_curriculum(envs, script.Args(), 0.7) == 1  # the paper
+    assert envs.radius_scale == 1 and envs.bonus_width == 0
 
 
 @pytest.mark.parametrize("std, dispersion, scale", [
@@ -140,18 +151,12 @@ def test_radius_curriculum(name, env_id, first, refine_from, progress, power):
 def test_the_rockets_curriculum(std, dispersion, scale):
     """R_terminal's scale is an eighth of the noise, within its bounds; guidance and groups are those of the flags."""
     rocket, envs = importlib.import_module("ppo_gtrxl_rocket"), gym.make_vec("RocketAscentCutoff-v0", num_envs=1)
-    args = rocket.Args(guidance="knots", flights_per_start=16, dispersion=dispersion)
-    assert rocket.set_curriculum(envs, args, 0.5, False, std) == envs.flights_per_start == 16
-    assert envs.guidance == "knots" and envs.terminal_scale == pytest.approx(scale)
-
-
-@pytest.mark.parametrize("env_id, chosen", [("RocketAscent-v0", "knots"), ("RocketAscentCutoff-v0", "none")])
-def test_the_climb_is_guided_at_a_fixed_time(env_id, chosen):
-    rocket, envs = importlib.import_module("ppo_gtrxl_rocket"), gym.make_vec(env_id, num_envs=1)
-    rocket.set_curriculum(envs, rocket.Args(), 0.5, False, std=1.0)
-    assert envs.guidance == chosen
-    rocket.set_curriculum(envs, rocket.Args(guidance="linear"), 0.5, False, std=1.0)
-    assert envs.guidance == "linear"
+    log_std = f"0:0.2 0.5:{math.log(std)} 1:-7"
+    args = rocket.Args(guidance=True, flights_per_start=16, dispersion=dispersion, log_std=log_std)
+    assert rocket.set_curriculum(envs, args, 0.5) == envs.flights_per_start == 16
+    assert envs.guidance and envs.terminal_scale == pytest.approx(scale)
+    rocket.set_curriculum(envs, rocket.Args(), 0.5)  # the paper
+    assert envs.flights_per_start == 1 and envs.terminal_scale == 0.005 and not envs.guidance
 
 
 @pytest.fixture
@@ -159,7 +164,7 @@ def schedules(learner, asked, monkeypatch):
     """The entropy's coefficient, lambda and the learning rate that update `iteration` of 11 uses."""
     lambdas, gae = [], script.gae
     monkeypatch.setattr(script, "gae", lambda *inputs: [lambdas.append(inputs[-1]), gae(*inputs)][1])
-    ends = {"learning_rate": 2e-3, "learning_rate_final": 1e-3, "ent_coef": 0.5, "ent_coef_final": 0.1}
+    ends = {"learning_rate": "0:2e-3 1:1e-3", "ent_coef": "0:0.5 1:0.1"}
 
     def of_update(iteration, **changes):
         run = learner(**{**ends, **changes}, total_updates=11)
@@ -176,10 +181,10 @@ def schedules(learner, asked, monkeypatch):
 
 def test_schedules_half_way(schedules):
     """Update 6 of 11 is half-way, 11 the end."""
-    lambdas = {"gae_lambda": 0.9, "gae_lambda_final": 1.0}
-    assert schedules(1, **lambdas) == pytest.approx((0.5, 0.9, 2e-3))
-    assert schedules(6, **lambdas) == pytest.approx((0.3, 0.95, 1.5e-3))
-    assert schedules(11, **lambdas) == pytest.approx((0.1, 1.0, 1e-3))
+    lambdas = "0:0.9 1:1"
+    assert schedules(1, gae_lambda=lambdas) == pytest.approx((0.5, 0.9, 2e-3))
+    assert schedules(6, gae_lambda=lambdas) == pytest.approx((0.3, 0.95, 1.5e-3))
+    assert schedules(11, gae_lambda=lambdas) == pytest.approx((0.1, 1.0, 1e-3))
     assert schedules(6, gae_lambda=0.7)[1] == 0.7
 
 
@@ -200,16 +205,15 @@ def test_memory_noise_half_way(learner, monkeypatch):
             script.train(run.args, run.agent, run.average, run.optimizer, run.envs, start)
         return asked.value.args[0]
 
-    falling = {"memory_noise": 0.2, "memory_noise_final": 0.0}
-    assert [of_update(iteration, **falling) for iteration in (1, 6, 11)] == pytest.approx([0.2, 0.1, 0.0])
+    assert [of_update(iteration, memory_noise="0:0.2 1:0") for iteration in (1, 6, 11)] == pytest.approx([0.2, 0.1, 0])
     assert of_update(6, memory_noise=0.2) == 0.2
 
 
 @pytest.mark.parametrize("log_std", [0.0, -1.5, -8.0])
 def test_learning_rate_follows_the_noise(schedules, log_std):
-    """--lr-schedule std: what a step does to the log-probabilities goes with its size over the standard deviation."""
-    fixed = {"noise": "schedule", "log_std": log_std, "log_std_final": log_std}
-    assert schedules(6, lr_schedule="std", **fixed)[2] == pytest.approx(2e-3 * math.exp(log_std))
+    """What a step does to the log-probabilities goes with its size over the standard deviation."""
+    rate = schedules(6, lr_times_std=True, log_std=f"0:{log_std}", learning_rate=2e-3)[2]
+    assert rate == pytest.approx(2e-3 * math.exp(log_std))
 
 
 # --- who sets the noise -----------------------------------------------------------------------------------------------
@@ -224,111 +228,37 @@ def log_stds(run, updates):
     return seen
 
 
-def test_scheduled_noise_is_linear(learner):
-    """From --log-std in update 1 to --log-std-final in the last one."""
-    run = learner(noise="schedule", log_std=-0.5, log_std_final=-2.5, total_updates=11)
-    assert log_stds(run, 11) == pytest.approx([*np.linspace(-0.5, -2.5, 11)[1:], -2.5])
-
-
-def test_noise_falls_from_wherever_it_is(learner):
-    """A checkpoint's log-std may lie on either side of the last one."""
-    for first in (-1.0, -4.0):
-        run = learner(noise="schedule", log_std=first, log_std_final=-2.0, total_updates=3)
-        assert log_stds(run, 3) == pytest.approx([(first - 2.0) / 2, -2.0, -2.0])
+def test_points_set_the_noise_of_their_update(learner):
+    """From the first point in update 1 to the last in the last one, wherever a checkpoint's noise was."""
+    run = learner(log_std="0:-0.5 0.5:-1 0.5:-3 1:-5", total_updates=11)
+    run.agent.actor_logstd.data.fill_(-7.0)
+    assert log_stds(run, 11) == pytest.approx([*np.linspace(-0.5, -1, 6)[:5], *np.linspace(-3, -5, 6)])
 
 
 def test_learned_noise_stays_where_it_can_be_learned(learner):
     """An entropy bonus pushes it up; beyond its bounds it would have no gradient, and never come back."""
-    assert log_stds(learner(noise="learned", log_std=0.5, ent_coef=1.0, ent_coef_final=1.0), 3) == [0.5] * 3
+    run = learner(log_std=0.5, ent_coef=1.0)
+    assert min(log_stds(run, 3)) > 0.5
+    run.collect()
+    assert script.set_noise(run.agent, run.args, 0.5) and run.agent.actor_logstd.item() == 0.5
 
 
 def test_noise_reaches_minus_eight(learner):
     """The policy samples with what the schedule ends at: a standard deviation of 3e-4."""
-    run = learner(noise="schedule", log_std_final=-8.0, total_updates=2)
-    assert log_stds(run, 2) == pytest.approx([-8.0, -8.0])
+    run = learner(log_std="0:-1 1:-8", total_updates=2)
+    assert log_stds(run, 2) == pytest.approx([-1.0, -8.0])
     std = run.agent.get_policy(torch.zeros(1, 8, dtype=torch.float64)).stddev
     assert std.item() == pytest.approx(math.exp(-8.0))
 
 
-@pytest.mark.parametrize("noise", ["learned", "schedule"])
-def test_only_learned_noise_is_learned(learner, noise):
-    run = learner(noise=noise, log_std_final=TINY["log_std"])
+@pytest.mark.parametrize("log_std", [-0.5, "0:-0.5"])
+def test_only_a_number_is_learned(learner, log_std):
+    run = learner(log_std=log_std)
     before = run.agent.actor_logstd.clone()
     run.update()
-    assert torch.equal(run.agent.actor_logstd, before) == (noise != "learned")
-    assert (run.agent.actor_logstd.grad is None) == (noise != "learned")
-
-
-# --- refinement -------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("refine_from, begins", [(0.0, [1]), (0.5, [6]), (0.51, [7]), (1.0, [11]), (None, [])])
-def test_refinement_begins_once(learner, monkeypatch, refine_from, begins):
-    """Of 11 updates; from then on the noise is no longer learned, and the environments know."""
-    run, seen, told = learner(refine_from=refine_from, total_updates=11), [], []
-    monkeypatch.setattr(script, "begin_refinement", lambda *inputs: seen.append(iteration))
-    for iteration in range(1, 12):
-        run.update(iteration)
-        told.append(not run.agent.actor_logstd.requires_grad)
-    assert seen == begins
-    assert told == [bool(begins) and iteration >= begins[0] for iteration in range(1, 12)]
-
-
-def test_refinement_in_the_middle_of_a_run(learner, asked):
-    """The critic's head is zero when the first minibatch is asked for; a resume after the beginning leaves it alone."""
-    run = learner(refine_from=0.5, log_std_refine=-3.0, flights_per_start=7, total_updates=11)
-    seen, encode = [], run.agent.encode
-
-    def watch(*inputs):
-        last = run.agent.critic[-1]
-        seen.append((bool(last.weight.any() or last.bias.any()), run.agent.actor_logstd.item()))
-        return encode(*inputs)
-
-    run.agent.encode = watch
-    before = copy.deepcopy(run.agent.state_dict())
-    run.update(6)
-    assert seen[0] == (False, pytest.approx(-3.0)) and all(moved for moved, _ in seen[1:])
-    run.agent.load_state_dict(before)
-    del seen[:]
-    run.update(7)
-    assert seen[0] == (True, TINY["log_std"])
-
-
-def test_refinement_leaves_the_policy(learner):
-    run = learner(log_std_refine=-3.0, flights_per_start=2)
-    hidden = torch.randn(5, 8, dtype=torch.float64)
-    mean = run.agent.get_mean_action(hidden)
-    script.begin_refinement(run.agent, run.args)
-    assert torch.equal(run.agent.get_mean_action(hidden), mean) and not run.agent.critic(hidden).any()
-
-
-def test_refinement_without_groups_leaves_the_critic(learner):
-    """It has no baseline to begin from."""
-    run = learner(log_std_refine=-3.0, flights_per_start=1)
-    hidden = torch.randn(5, 8, dtype=torch.float64)
-    values = run.agent.critic(hidden)
-    script.begin_refinement(run.agent, run.args)
-    assert torch.equal(run.agent.critic(hidden), values) and values.any()
-
-
-@pytest.mark.parametrize("log_std_refine", [-2.0, None])
-def test_noise_of_the_refinement(learner, log_std_refine):
-    """Learned until update 5 of 11, then set, or left where it is, from where it falls by equal steps to its end."""
-    settings = {"refine_from": 0.5, "log_std_refine": log_std_refine, "log_std_final": -5.0}
-    run = learner(noise="learned", total_updates=11, **settings)
-    seen = log_stds(run, 11)
-    assert len(set(seen[:5])) == 5 and np.abs(np.array(seen[:5]) - TINY["log_std"]).max() < 0.1
-    first = seen[4] if log_std_refine is None else log_std_refine
-    assert seen[5:] == pytest.approx([*np.linspace(first, -5.0, 6)[1:], -5.0])
-
-
-@pytest.mark.parametrize("env_id", script.ENV_IDS)
-def test_starts_are_flown_in_groups_in_the_refinement(env_id):
-    envs = gym.make_vec(env_id, num_envs=1)
-    for refines in (False, True, False):
-        group = script.set_curriculum(envs, script.Args(flights_per_start=8), 0.5, refines, std=1.0)
-        assert group == envs.flights_per_start == (8 if refines else 1)
+    learned = log_std == -0.5
+    assert torch.equal(run.agent.actor_logstd, before) == (not learned)
+    assert (run.agent.actor_logstd.grad is None) == (not learned)
 
 
 # --- groups of flights that began alike -------------------------------------------------------------------------------
@@ -455,7 +385,7 @@ def test_flights_of_a_group_share_their_start_and_nothing_else(env_id):
     args = make_args(env_id=env_id, flights_per_start=3)
     envs = gym.make_vec(env_id, num_envs=6)
     envs.reset(seed=1)
-    script.set_curriculum(envs, args, 0.0, True, std=1.0)
+    script.set_curriculum(envs, args, 0.0)
     batch, _ = script.rollout(make_agent(args, envs), envs, 1.0, 0.1)
     first, second = batch.obs[0, :3], batch.obs[0, 3:]
     assert (first == first[0]).all() and (second == second[0]).all() and (first[0, :2] != second[0, :2]).all()

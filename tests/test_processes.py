@@ -14,7 +14,6 @@ import torch
 import torch.distributed as dist
 import torch.multiprocessing as multiprocessing
 from conftest import UnevenEnvs, update
-from one_update import script_args
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 import ppo_gtrxl_di as script
@@ -44,7 +43,7 @@ def learn(rank, world, folder, settings):
     if world > 1:
         dist.init_process_group("gloo", init_method=f"file://{folder}/meet", rank=rank, world_size=world)
     settings = {"learning_rate": 1e-3, **settings}
-    args = script_args(script, **SIZES, num_minibatches=2, update_epochs=2, **settings)
+    args = script.Args(**SIZES, num_minibatches=2, update_epochs=2, **settings)
     envs = UnevenEnvs(LENGTHS)
     envs.num_envs, envs.flights_per_start = len(LENGTHS) // world, args.flights_per_start
     torch.manual_seed(0)
@@ -157,7 +156,7 @@ def test_torchrun_death_and_resume(tmp_path):
 
 
 def parse(*argv):
-    return runs.parse_args(script.Args, argv, script.ENV_OPTIONS, script.BUFFERS)[0]
+    return runs.parse_args(script.Args, script.recipe, argv, script.ENV_OPTIONS, script.BUFFERS)[0]
 
 
 def test_processes_fly_starts_of_their_own(monkeypatch):
@@ -188,7 +187,8 @@ def test_every_process_flies_whole_groups(monkeypatch):
 def test_shares_of_different_sizes(monkeypatch):
     """Without groups three and two environments are as good as any."""
     monkeypatch.setenv("WORLD_SIZE", "2")
-    assert parse("--num-envs=5").flights_per_start == 1
+    assert parse("--num-envs=5", "--recipe=paper").flights_per_start == 1
+    assert parse("--num-envs=5").flights_per_start == "0:1 0.4:1 0.4:1"  # lowered from 8
 
 
 def test_moments_are_those_of_the_living(monkeypatch):

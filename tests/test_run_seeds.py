@@ -17,7 +17,7 @@ pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parent.parent
 TINY = "--embed-dim 8 --num-heads 2 --num-blocks 1 --memory-length 4 --mlp-dim 8 --hidden-dim 8 --num-envs 2"
-TINY += " --num-minibatches 2 --update-epochs 2 --eval-starts 10 --num-threads 1"
+TINY += " --num-minibatches 2 --update-epochs 2 --eval-starts 10 --recipe paper"
 
 
 def start(folder, lines):

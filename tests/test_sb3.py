@@ -19,6 +19,7 @@ from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
+from rocket.task import RocketTask
 from sb3_env import NativeVecEnv
 
 ROOT = Path(__file__).parent.parent
@@ -149,72 +150,41 @@ def test_the_benchmark_follows_our_curriculum():
     assert prices == [(pytest.approx(price), 1) for price in (0, 0, 3 * 0.25 / 0.35, 3 * (1 - 0.9 * 0.15 / 0.4))]
 
 
-class Recorder(NativeVecEnv):
-    """Keeps every observation with its environment and the step of its flight; the first copy crashes at the start."""
-
-    def reset(self):
-        self.step_of, self.seen, self.steps_taken = [0] * self.num_envs, [], 0
-        return self._keep(super().reset())
-
-    def step_wait(self):
-        if self.steps_taken < 3:
-            self.actions[0] = [-1.0, 0.0, 0.0]
-        self.steps_taken += 1
-        obs, rewards, dones, infos = super().step_wait()
-        self.step_of = [0 if done else step + 1 for done, step in zip(dones, self.step_of)]
-        return self._keep(obs), rewards, dones, infos
-
-    def _keep(self, obs):
-        self.seen.append([(k, step, obs[k].copy()) for k, step in enumerate(self.step_of)])
-        return obs
-
-
-def mean_flights(seen, rollout):
-    """The expected `mean_flight` after each rollout of so many steps, one after the other, by plain loops."""
-    from test_mean_flight import compared
-
-    rocket, mean = envs.ROCKETS["RocketAscentCutoff-v0"].rocket, np.zeros((482, 7))
-    for first in range(0, len(seen) - 1, rollout):
-        flown = {(step, k): obs for moment in seen[first : first + rollout + 1] for k, step, obs in moment}
-        for t in {step for step, _ in flown}:
-            new = np.mean(
-                [compared(obs.astype(float), rocket) for (step, _), obs in flown.items() if step == t], axis=0
-            )
-            mean[t] += (new - mean[t]) * (0.1 if mean[t].any() else 1.0)
-    return mean
-
-
 @pytest.mark.parametrize("recurrent", [False, True])
-def test_the_benchmark_learns_the_mean_of_dispersed_flights(recurrent):
-    """Over three rollouts, flights that begin in the middle of one, and a crash; it changes nothing at first."""
+def test_the_benchmark_keeps_the_nominal_flight(recurrent):
+    """That of the policy that the training begins with; it changes nothing at first, and is flown once."""
     sb3_contrib = pytest.importorskip("sb3_contrib")
     import sb3_ppo
 
     import ppo_gtrxl_rocket as script
 
-    env_id, rollout, cleared = "RocketAscentCutoff-v0", 30, []
-    args = script.Args(env_id=env_id, dispersion=1.0)
-    recorder = Recorder(gym.make_vec(env_id, num_envs=4, action_frame="local", dispersion=1.0))
-    seen = sb3_ppo.OurFeatures(recorder, script, env_id)
+    env_id, options = "RocketAscentCutoff-v0", {"action_frame": "local", "dispersion": 1.0}
+    seen = sb3_ppo.OurFeatures(NativeVecEnv(gym.make_vec(env_id, num_envs=4, **options)), script, env_id)
     kind, policy = (sb3_contrib.RecurrentPPO, "MlpLstmPolicy") if recurrent else (PPO, "MlpPolicy")
-    sizes = {"n_steps": rollout, "batch_size": 60, "n_epochs": 1, "device": "cpu", "seed": 0}
-    model = kind(policy, VecNormalize(seen), policy_kwargs={"log_std_init": -3.0}, **sizes)
+    model = kind(policy, VecNormalize(seen), n_steps=30, batch_size=60, n_epochs=1, device="cpu", seed=0)
     model.policy.action_net.bias.data = torch.tensor(script.INITIAL_ACTION)
+    kept = []
 
-    class Watch(sb3_ppo.OurMeanFlight):
-        def _on_rollout_end(self):
-            before = [weight[:, -7:].abs().max() for weight in sb3_ppo.input_weights(self.model.policy)]
-            super()._on_rollout_end()
-            after = [weight[:, -7:].abs().max() for weight in sb3_ppo.input_weights(self.model.policy)]
-            cleared.append((min(before) > 0, max(after) == 0, self.training_env.obs_rms.var[-7:].copy()))
+    class Watch(sb3_ppo.OurNominalFlight):
+        def _on_training_start(self):
+            flown = sb3_ppo.make_policy(self.model, self.training_env)
+            nominal = gym.make_vec(env_id, num_envs=1, action_frame="local")
+            obs, _ = nominal.reset()
+            before = flown(obs, 0)
+            super()._on_training_start()
+            np.testing.assert_allclose(flown(obs, 0), before, atol=1e-6)
+            next_obs, _, _, _ = nominal.advance(before)
+            _, _, _, compared = script.motion(seen.constants, torch.as_tensor(next_obs, dtype=torch.float32))
+            kept.append((seen.constants.nominal_flight.clone(), compared[0]))
 
-    model.learn(3 * 4 * rollout, callback=Watch(script, args, seen))
-    expected = mean_flights(recorder.seen, rollout)
-    assert expected.any(axis=1).sum() > 85 and recorder.step_of[0] < recorder.step_of[1]  # it did crash
-    np.testing.assert_allclose(seen.constants.mean_flight.numpy(), expected, rtol=1e-4, atol=1e-4)
-    assert [(before, zero) for before, zero, _ in cleared] == [(True, True), (False, True), (True, False)]
-    assert (cleared[0][2] == 1).all() and (cleared[2][2] > 0.1).all()  # not enlarged
-    assert np.abs(model.get_vec_normalize_env().normalize_obs(seen(seen.raw))[:, -7:]).max() > 0.01
+    for _ in range(2):
+        model.learn(60, callback=Watch(script, env_id, options, seen))
+    (flight, second_row), (again, _) = kept
+    torch.testing.assert_close(flight[1, 2:], second_row)
+    assert flight[:, 2:].any(dim=1).sum() > 50 and torch.equal(flight, again)
+    assert vars(model.get_vec_normalize_env())["nominal_flight"] is seen.constants.nominal_flight
+    differs = model.get_vec_normalize_env().normalize_obs(seen(seen.raw))[:, -7:]
+    assert 0.01 < np.abs(differs).max() <= 10
 
 
 def test_the_benchmarks_dispersed_run(tmp_path, monkeypatch):
@@ -235,7 +205,7 @@ def test_the_benchmarks_dispersed_run(tmp_path, monkeypatch):
 
     monkeypatch.setattr(sb3_ppo, "make_model", keep_model)
     monkeypatch.setattr(sb3_ppo.evaluate, "evaluate", keep_evaluation)
-    monkeypatch.setattr(sb3_ppo.evaluate, "table", str)
+    monkeypatch.setattr(RocketTask, "table", lambda task, metrics: "")
     monkeypatch.chdir(tmp_path)
     flags = "--env-id RocketAscentCutoff-v0 --num-envs 1 --batch-size 1000 --epochs 1 --samples 900".split()
 
@@ -262,4 +232,4 @@ def test_the_benchmarks_dispersed_run(tmp_path, monkeypatch):
     assert made[2][:2] == (3.0, 1.0) and made[2][2] != made[0][2] and max(made[2][2]) < -1.3  # learnt
     assert evaluated == [(1000, 0.0)] * 2 + [(1705, 1.0)] * 4  # twice in each run
     saved = pickle.loads((tmp_path / "dispersed.pkl").read_bytes())
-    assert vars(saved)["mean_flight"][:100].any(dim=1).all()
+    assert vars(saved)["nominal_flight"][:100].any(dim=1).all()

@@ -1,0 +1,189 @@
+"""Dispersed flights beside the nominal one: what `prepare` keeps of it, how it is looked up, what is seen."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+import ppo_gtrxl_rocket as script
+from envs import ROCKETS, local_frame, target_axes
+
+CUTOFF = "RocketAscentCutoff-v0"
+SMALL = {"embed_dim": 8, "num_heads": 2, "mlp_dim": 8, "hidden_dim": 8, "num_blocks": 1, "memory_length": 4}
+SCALES = [0.03, 0.015, 0.005, 0.0015, 0.004, 0.003, 0.001]
+torch.set_num_threads(1)
+
+
+def compared(y, rocket):
+    """What flights are compared by, of one state, in the plain units of the text: 100 km, km/s, 7.9 km/s, rad."""
+    r, v = y[:3], y[3:6]
+    perigee, semi_latus, normal = target_axes(rocket)
+    radius, circular = np.linalg.norm(r), np.sqrt(rocket.mu / rocket.Re)
+    altitude, climb = 64 * (radius / rocket.Re - 1), 8 * (r @ v) / radius / circular
+    out = 64 * (r @ normal) / rocket.Re, 8 * (v @ normal) / circular
+    angle = np.arctan2(r @ semi_latus, r @ perigee)
+    return [altitude, climb, *out, np.linalg.norm(v) / circular, np.log(y[6] / rocket.dry_mass), angle]
+
+
+def make_agent(dispersion=1.0, env_id=CUTOFF, **options):
+    """A small agent in double precision, its args, which name a policy to begin with, and the environment's options."""
+    args = script.Args(**SMALL, env_id=env_id, dispersion=dispersion, checkpoint="a policy", **options)
+    env_options = {name: getattr(args, name) for name in script.ENV_OPTIONS} | script.FIXED_OPTIONS
+    torch.manual_seed(0)
+    return script.Agent(args, gym.make_vec(env_id, num_envs=1, **env_options)).double(), args, env_options
+
+
+def climb(obs, t):
+    """Up, and tilted more and more: a flight of all burns."""
+    tilt = min(1.5, 0.01 * t)
+    return np.tile([np.cos(tilt), np.sin(tilt), 0.0], (len(obs), 1))
+
+
+def fly(policy, num_envs=1, env_id=CUTOFF, **options):
+    """The observations (T + 1, N, 9) of N flights by a policy, and when each ended (N,)."""
+    env = gym.make_vec(env_id, num_envs=num_envs, action_frame="local", **options)
+    obs, _ = env.reset(seed=5)
+    seen, ended = [obs], np.full(num_envs, -1)
+    while (ended < 0).any():
+        obs, _, terminated, _ = env.advance(policy(obs, len(seen) - 1))
+        seen.append(obs)
+        ended[terminated & (ended < 0)] = len(seen) - 1
+    return np.array(seen), ended
+
+
+def energy(y, rocket):
+    """The specific energy in units of mu / Re."""
+    return 0.5 * (y[3:6] @ y[3:6]) * rocket.Re / rocket.mu - rocket.Re / np.linalg.norm(y[:3])
+
+
+@pytest.fixture(scope="module")
+def flown():
+    """An agent that keeps the nominal flight of `climb`, and that flight's observations (T + 1, 9)."""
+    agent, _, _ = make_agent()
+    script.fly_nominal(agent, climb, gym.make_vec(CUTOFF, num_envs=1, action_frame="local"))
+    seen, _ = fly(climb)
+    return agent, seen[:, 0]
+
+
+def test_the_nominal_flight_is_kept_as_it_was_flown(flown):
+    """Burn, energy and what is compared of every step, the last one's too."""
+    agent, seen = flown
+    rocket = ROCKETS[CUTOFF].rocket
+    table = agent.nominal_flight.numpy()
+    assert table.shape == (482, 9) and len(seen) == 482
+    np.testing.assert_array_equal(table[:, 0], np.round(3 * seen[:, 8]))
+    assert set(table[:, 0]) == {0, 1, 2, 3}
+    expected = [[energy(y, rocket), *compared(y, rocket)] for y in seen]
+    np.testing.assert_allclose(table[:, 1:], expected, rtol=1e-5, atol=2e-5)  # of single precision
+
+
+def test_a_flight_that_ends_early_leaves_rows_of_no_burn():
+    agent, _, _ = make_agent()
+    crash = lambda obs, t: np.tile([-1.0, 0.1, 0.0], (len(obs), 1))  # noqa: E731
+    script.fly_nominal(agent, crash, gym.make_vec(CUTOFF, num_envs=1, action_frame="local"))
+    burns = agent.nominal_flight[:, 0]
+    assert 2 <= (burns == 0).sum() < 100 and (burns > 0).sum() == (burns == 4).sum()
+    seen, _ = fly(climb, 2, dispersion=1.0)  # later burns than it had
+    assert script.features(agent, torch.as_tensor(seen)).isfinite().all()
+
+
+def test_the_nominal_flight_differs_in_nothing_from_itself(flown):
+    agent, seen = flown
+    differs = script.features(agent, torch.as_tensor(seen))[:, -7:]
+    assert differs.abs().max() < 0.02
+
+
+def by_hand(y, burn, table, rocket):
+    """The same by a plain search among the burn's rows, beyond which the nearest two are extended."""
+    rows = table[table[:, 0] == burn]
+    here = energy(y, rocket)
+    k = int(np.clip(np.searchsorted(rows[:, 1], here), 1, len(rows) - 1))
+    share = (here - rows[k - 1, 1]) / (rows[k, 1] - rows[k - 1, 1])
+    nominal = rows[k - 1, 2:] + share * (rows[k, 2:] - rows[k - 1, 2:])
+    return np.clip((compared(y, rocket) - nominal) / SCALES, -10, 10)
+
+
+def test_dispersed_flights_are_seen_beside_it_at_equal_energy(flown):
+    """Eight vehicles, all their steps; whatever the clock says."""
+    agent, _ = flown
+    rocket, table = ROCKETS[CUTOFF].rocket, agent.nominal_flight.numpy().astype(float)
+    seen, ended = fly(climb, 8, dispersion=1.0)
+    features = script.features(agent, torch.as_tensor(seen)).numpy()
+    assert features.shape[2] == 36
+    checked = 0
+    for k in range(8):
+        for t in range(20, ended[k], 7):
+            expected = by_hand(seen[t, k], round(3 * seen[t, k, 8]), table, rocket)
+            np.testing.assert_allclose(features[t, k, -7:], expected, atol=0.05)
+            checked += np.abs(expected).max() > 0.5
+    assert checked > 100  # they are told apart
+    later = seen[100, :1].copy()
+    later[:, 7] -= 0.2
+    at_once = [script.features(agent, torch.as_tensor(obs))[0, -7:] for obs in (seen[100, :1], later)]
+    assert torch.equal(*at_once)
+
+
+def test_a_flight_three_kilometres_higher_reads_one(flown):
+    """The sizes are what their comment says they are: at equal energy it is slower, which reads as well."""
+    agent, seen = flown
+    rocket = ROCKETS[CUTOFF].rocket
+    y = seen[30].copy()
+    up, _, _ = local_frame(y[:7, None], target_axes(rocket)[2])
+    radius = np.linalg.norm(y[:3])
+    y[:3] += 3000 * 6378145 / 6.4e6 * up[:, 0]  # 64: the unit of length is 99.66 km
+    slower = y[3:6] @ y[3:6] - 2 * rocket.mu * (1 / radius - 1 / np.linalg.norm(y[:3]))
+    y[3:6] *= np.sqrt(slower / (y[3:6] @ y[3:6]))
+    differs = script.features(agent, torch.as_tensor(y)[None])[0, -7:]
+    assert differs[0] == pytest.approx(1.0, abs=0.03)
+    circular = np.sqrt(rocket.mu / rocket.Re)
+    expected = (np.sqrt(slower) - np.linalg.norm(seen[30, 3:6])) / circular / 0.004
+    assert differs[4] == pytest.approx(expected, abs=0.03)
+
+
+def test_before_a_dispersed_training_nothing_is_seen():
+    agent, _, _ = make_agent()
+    seen, _ = fly(climb, 2, dispersion=1.0)
+    assert not script.features(agent, torch.as_tensor(seen))[..., -7:].any()
+
+
+@pytest.mark.parametrize("observe_draw", [False, True])
+def test_what_comes_into_sight_changes_nothing_at_first(observe_draw):
+    """The policy that a dispersed training begins with flies on as it did; so does one that will see the draw."""
+    agent, args, env_options = make_agent(observe_draw=observe_draw)
+    obs = torch.as_tensor(fly(climb, 4, dispersion=1.0, observe_draw=observe_draw)[0][:60]).transpose(0, 1)
+    memory = agent.new_memory(4, 0.0)
+    blind = obs.clone()
+    blind[..., 9:] = 0.0  # as nominal flights show it
+    before = agent.encode(blind, memory)
+    script.prepare(agent, args, env_options)
+    torch.testing.assert_close(agent.encode(obs, memory), before, rtol=0, atol=0)
+    assert agent.nominal_flight.any()
+    with torch.no_grad():
+        agent.encoder[0].weight[:, -7:] = 0.5
+    kept = agent.nominal_flight.clone()
+    script.prepare(agent, args, env_options)  # a policy that has its nominal flight keeps it
+    assert (agent.encoder[0].weight[:, -7:] == 0.5).all() and torch.equal(agent.nominal_flight, kept)
+
+
+@pytest.mark.parametrize(
+    "changes", [{"dispersion": 0.0}, {"checkpoint": None}, {"eval_only": True}, {"resume": "runs/before"}], ids=str
+)
+def test_nothing_is_flown_where_no_dispersed_training_begins(changes):
+    agent, args, env_options = make_agent()
+    vars(args).update(changes)
+    before = {name: tensor.clone() for name, tensor in agent.state_dict().items()}
+    script.prepare(agent, args, env_options)
+    for name, tensor in agent.state_dict().items():
+        assert torch.equal(tensor, before[name]), name
+
+
+def test_the_policy_itself_flies_it():
+    """By its mean action, nominal vehicle and all."""
+    agent, args, env_options = make_agent()
+    script.prepare(agent, args, env_options)
+    agent.nominal_flight.zero_()
+    script.fly_nominal(agent, agent.make_policy(481), gym.make_vec(CUTOFF, num_envs=1, action_frame="local"))
+    kept = agent.nominal_flight.clone()
+    again, _, _ = make_agent()
+    script.prepare(again, args, env_options)
+    torch.testing.assert_close(again.nominal_flight, kept, rtol=1e-5, atol=1e-5)
