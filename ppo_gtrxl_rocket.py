@@ -231,6 +231,53 @@ def features(agent, obs):
     return torch.cat(seen, dim=-1)
 
 
+def mean_action(output, action_scale):
+    """The policy's mean, a unit vector: the environment normalises the action, a longer mean would be less noise."""
+    return F.normalize(output, dim=-1)
+
+
+def describe(episodes, metrics):
+    """What a progress line says of the sampled episodes (`final_info` arrays) and of the last evaluation, if any."""
+    line = f"return {episodes['episodic_return'].mean():7.2f}  sampled error {np.median(episodes['error_norm']):.4f}"
+    if not metrics:
+        return line
+    orbit = f"a {metrics['a_km']:.1f} km  e {metrics['e']:.4f}  i {metrics['i_deg']:.2f}"
+    return f"{line}  mean action: error {metrics['error_norm']:.6f}  {orbit}  mass {metrics['final_mass_kg']:.1f} kg"
+
+
+# Problem, ours: what only training changes, and what it is paid -------------------------------------------------------
+def set_curriculum(envs, args, progress):
+    """What only training changes, all of it ours; returns how many flights in a row have the same start, or draw.
+
+    The noise scatters the ends of the flights by about std / 10, so R_terminal's scale follows it once it is small.
+    On dispersed flights the scale is at least 0.001 (smaller was no better). A learned noise leaves it as it is.
+    """
+    std = math.exp(at(args.log_std, progress))
+    smallest = 0.001 if args.dispersion else 0.0
+    envs.terminal_scale = min(TERMINAL_SCALE, max(std / 8, smallest))
+    envs.guidance = args.guidance
+    envs.flights_per_start = round(at(args.flights_per_start, progress))
+    return envs.flights_per_start
+
+
+def shape_rewards(envs, args, progress, batch, episodes):
+    """With cut-off, pay a flight's last step its `mass_rewards`. Ours.
+
+    They cannot matter before the flights reach their orbit; at the end the orbit alone counts.
+    """
+    if not envs.cutoff:
+        return
+    weight = at(args.mass_weight, progress)
+    if weight == 0:
+        return
+    group_size = envs.flights_per_start if args.dispersion else len(episodes["error"])
+    paid = weight * mass_rewards(episodes, envs.rocket, envs.terminal_scale, group_size)
+    paid = runs.local_shard(paid, envs.num_envs)  # of this process's flights
+    last_step = batch.alive.sum(0).long() - 1  # (N,)
+    flight = torch.arange(envs.num_envs)
+    batch.rewards[last_step, flight] += torch.as_tensor(paid * args.reward_scale).to(batch.rewards)
+
+
 def nominal_at(agent, burn, energy):
     """`motion`'s seven quantities (..., 7) of the nominal flight in this burn (...) at this energy (...).
 
@@ -279,52 +326,6 @@ def fly_nominal(agent, policy, envs):
     rows[:, 1] = energy.cummax(dim=0).values
     rows[:, 2:] = compared
     agent.nominal_flight[len(obs) :, 0] = len(agent.phases)  # after its end: a burn that there is not
-
-
-def mean_action(output, action_scale):
-    """The policy's mean, a unit vector: the environment normalises the action, a longer mean would be less noise."""
-    return F.normalize(output, dim=-1)
-
-
-def shape_rewards(envs, args, progress, batch, episodes):
-    """With cut-off, pay a flight's last step its `mass_rewards`. Ours.
-
-    They cannot matter before the flights reach their orbit; at the end the orbit alone counts.
-    """
-    if not envs.cutoff:
-        return
-    weight = at(args.mass_weight, progress)
-    if weight == 0:
-        return
-    group_size = envs.flights_per_start if args.dispersion else len(episodes["error"])
-    paid = weight * mass_rewards(episodes, envs.rocket, envs.terminal_scale, group_size)
-    paid = runs.local_shard(paid, envs.num_envs)  # of this process's flights
-    last_step = batch.alive.sum(0).long() - 1  # (N,)
-    flight = torch.arange(envs.num_envs)
-    batch.rewards[last_step, flight] += torch.as_tensor(paid * args.reward_scale).to(batch.rewards)
-
-
-def set_curriculum(envs, args, progress):
-    """What only training changes, all of it ours; returns how many flights in a row have the same start, or draw.
-
-    The noise scatters the ends of the flights by about std / 10, so R_terminal's scale follows it once it is small.
-    On dispersed flights the scale is at least 0.001 (smaller was no better). A learned noise leaves it as it is.
-    """
-    std = math.exp(at(args.log_std, progress))
-    smallest = 0.001 if args.dispersion else 0.0
-    envs.terminal_scale = min(TERMINAL_SCALE, max(std / 8, smallest))
-    envs.guidance = args.guidance
-    envs.flights_per_start = round(at(args.flights_per_start, progress))
-    return envs.flights_per_start
-
-
-def describe(episodes, metrics):
-    """What a progress line says of the sampled episodes (`final_info` arrays) and of the last evaluation, if any."""
-    line = f"return {episodes['episodic_return'].mean():7.2f}  sampled error {np.median(episodes['error_norm']):.4f}"
-    if not metrics:
-        return line
-    orbit = f"a {metrics['a_km']:.1f} km  e {metrics['e']:.4f}  i {metrics['i_deg']:.2f}"
-    return f"{line}  mean action: error {metrics['error_norm']:.6f}  {orbit}  mass {metrics['final_mass_kg']:.1f} kg"
 
 
 # Shared: Gated Transformer-XL ("Gated Transformer-XL Implementation") -------------------------------------------------

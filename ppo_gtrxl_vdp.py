@@ -152,14 +152,14 @@ def mean_action(output, action_scale):
     return output * action_scale
 
 
-def prepare(agent, args, env_options):
-    """Nothing: no constant of these problems is found by flying."""
+def describe(episodes, metrics):
+    """What a progress line says of the sampled episodes (`final_info` arrays) and of the last evaluation, if any."""
+    hit = " ".join(f"{share:4.0%}" for share in episodes["hit"].mean(axis=0))
+    ratio = f"  ratio {metrics['ratio_of_sums']:.4f}" if "ratio_of_sums" in metrics else ""
+    return f"return {episodes['episodic_return'].mean():8.2f}  cost {episodes['cost'].mean():7.3f}  hits {hit}{ratio}"
 
 
-def shape_rewards(envs, args, progress, batch, episodes):
-    """Nothing: training is paid what the environment pays."""
-
-
+# Problem, ours: what only training changes, and what it is paid -------------------------------------------------------
 def set_curriculum(envs, args, progress):
     """What only training changes, all of it ours; returns how many flights in a row have the same start.
 
@@ -176,11 +176,12 @@ def set_curriculum(envs, args, progress):
     return group
 
 
-def describe(episodes, metrics):
-    """What a progress line says of the sampled episodes (`final_info` arrays) and of the last evaluation, if any."""
-    hit = " ".join(f"{share:4.0%}" for share in episodes["hit"].mean(axis=0))
-    ratio = f"  ratio {metrics['ratio_of_sums']:.4f}" if "ratio_of_sums" in metrics else ""
-    return f"return {episodes['episodic_return'].mean():8.2f}  cost {episodes['cost'].mean():7.3f}  hits {hit}{ratio}"
+def shape_rewards(envs, args, progress, batch, episodes):
+    """Nothing: training is paid what the environment pays."""
+
+
+def prepare(agent, args, env_options):
+    """Nothing: no constant of these problems is found by flying."""
 
 
 # Shared: Gated Transformer-XL ("Gated Transformer-XL Implementation") -------------------------------------------------

@@ -70,8 +70,7 @@ def main():
     print("standard deviations of the differences, in their sizes:", ", ".join(NAMES))
     print("and R squared of the final misses, by the differences / by their tanh:", ", ".join(misses))
     for t in [*range(50, late[0], round(100 / dt)), *late]:
-        _, _, compared = SCRIPT.motion(agent, obs[t])
-        differences = ((compared - agent.mean_flight[t]) / agent.differences).numpy().clip(-10, 10)
+        differences = SCRIPT.features(agent, obs[t])[:, -len(NAMES) :].numpy()
         spread = " ".join(f"{size:5.2f}" for size in differences.std(axis=0))
         flat = np.tanh(differences)
         shares = (f"{explained(differences, y):5.2f} /{explained(flat, y):5.2f}" for y in misses.values())
