@@ -181,7 +181,7 @@ def opponents_command(args):
     task.fly_opponents(
         args.folder,
         dispersion=args.dispersion,
-        n=args.starts or task.default_flights(trains=False, dispersion=args.dispersion),
+        n=args.starts or task.default_flights(is_brief=False, dispersion=args.dispersion),
         solved=args.solved,
         eval_seed=args.eval_seed,
         also=args.also,

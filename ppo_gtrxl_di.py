@@ -2,12 +2,12 @@
 
     python ppo_gtrxl_di.py --seed 1                                        # by our recipe, as results/di
     python ppo_gtrxl_di.py --seed 1 --env-id DoubleIntegratorWaypoints-v0  # two waypoints, one policy
-    python ppo_gtrxl_di.py --seed 1 --recipe paper                         # Table 1 as printed
+    python ppo_gtrxl_di.py --seed 1 --recipe paper                         # plain PPO with Table 1
     python ppo_gtrxl_di.py --eval-only --checkpoint results/di/agent.safetensors
 
 Top to bottom: arguments, recipes, problem, Gated Transformer-XL, agent, PPO, what we add to it, training, main.
-From the first "Shared" on, all ppo_gtrxl_*.py are the same to the letter. T steps, N environments, L memory, d width,
-H heads.
+From the first "Shared" on, all ppo_gtrxl_*.py are the same to the letter. "Ours" is what the paper does not have.
+T steps, N environments (Algorithm 1: E), L memory length, d width, H heads, dk = d / H.
 """
 
 from __future__ import annotations
@@ -27,14 +27,16 @@ import runs
 from runs import Schedule, all_reduce_sum
 
 
+# A schedule is a number, or "place:value place:value": place 0 is the first update, 1 the last; linear between the
+# points, constant before the first and after the last. Two points at one place are a jump.
 @dataclass
 class Args:
-    """The paper: Table 1's column of this problem, and what it leaves open. RECIPES has what we change."""
+    """The arguments; by default Table 1's column of this problem. RECIPES has what we change."""
 
     # experiment
     exp_name: str = Path(__file__).stem  # the name of this experiment
     seed: int = 1  # seed of the experiment
-    recipe: str = "ours"  # what no flag sets: ours (RECIPES) or paper (Table 1 and nothing of ours in the learning)
+    recipe: str = "ours"  # what no flag sets: ours (RECIPES) or paper (plain PPO with Table 1, as the defaults below)
     torch_deterministic: bool = True  # if toggled, `torch.backends.cudnn.deterministic=True`
     cuda: bool = True  # if toggled, a GPU is used when there is one
     num_threads: int = 1  # CPU threads of torch (0: torch's own choice); bits depend on it
@@ -58,42 +60,41 @@ class Args:
     observe_phase: bool = True  # show time and phase to the policy
     observe_velocity: bool = True  # show the velocity to the policy
 
-    # transformer (Table 1)
+    # Table 1
     num_blocks: int = 3  # number of GTrXL blocks (0: a plain MLP, without memory)
     embed_dim: int = 128  # embedding dimension d
     num_heads: int = 2  # number of attention heads
     memory_length: int = 32  # memory length L: a step attends to itself and the L steps before it
     mlp_dim: int = 128  # width of the position-wise MLP
     hidden_dim: int = 128  # width of the hidden layer of each head
-    memory_noise: Schedule = 0.1  # spread of the memory before an episode (Algorithm 1, line 5: "small")
-
-    # PPO (Table 1 where it has a row; docs/decisions.md has the rest)
-    total_updates: int = 1000  # number of updates
-    num_envs: int = 80  # parallel environments, one episode each per update (256 steps of 16 workers, a guess)
-    learning_rate: Schedule = "0:3e-4 1:3e-5"  # the learning rate of the optimizer
     gamma: float = 0.99  # the discount factor gamma
     gae_lambda: Schedule = 0.95  # the lambda for the general advantage estimation
-    num_minibatches: int = 4  # the number of mini-batches of whole episodes
+    total_updates: int = 1000  # number of updates
     update_epochs: int = 8  # the K epochs to update the policy
-    norm_adv: bool = True  # normalise the advantages over an update
-    clip_coef: float = 0.2  # the surrogate clipping coefficient
-    ent_coef: Schedule = "0:1e-3 1:1e-4"  # coefficient of the entropy
     vf_coef: float = 0.2  # coefficient of the value function
+    learning_rate: Schedule = "0:3e-4 1:3e-5"  # the learning rate of the optimizer
+    ent_coef: Schedule = "0:1e-3 1:1e-4"  # coefficient of the entropy
+    clip_coef: float = 0.2  # the surrogate clipping coefficient
+
+    # not in Table 1: our choice
+    num_envs: int = 80  # parallel environments, one episode each per update (256 steps of 16 workers, a guess)
+    num_minibatches: int = 4  # the number of mini-batches of whole episodes
+    norm_adv: bool = True  # normalise the advantages over an update
     max_grad_norm: float = 0.5  # the maximum norm for the gradient clipping
     target_kl: float | None = None  # the KL divergence from which an update takes no further step (none: no limit)
-    log_std: Schedule = 0.0  # log of the std in the unit of the action: a number, learned from there; points, set
+    log_std: Schedule = 0.0  # log of the std in the action's unit. A number: learned from there; points: set
+    memory_noise: Schedule = 0.1  # std of the memory before an episode (Algorithm 1, line 5; the text says "small")
+    reward_scale: float = 1.0  # factor on the rewards in training; everything logged is unscaled
 
     # ours: off here, on in RECIPES
-    reward_scale: float = 1.0  # factor on the rewards in training; everything logged is unscaled
-    lr_times_std: bool = False  # multiply the learning rate by the policy's std
+    lr_times_std: bool = False  # the learning rate is --learning-rate times the policy's std
     flights_per_start: Schedule = 1  # flights of each start, compared with one another
     log_radius: Schedule = 0.0  # waypoints: log of the training radius in target radii
     weight_average: float = 0.0  # decay, per optimiser step, of the averaged weights used in evaluation
 
 
-# Recipes: what ours changes -------------------------------------------------------------------------------------------
-# A schedule is "place:value place:value": 0 is the first update, 1 the last, linear in between. The noise falls as a
-# learned one would, until the flights are compared in groups; from there it falls evenly to next to nothing.
+# Recipes: the values of Args that we replace (why: docs/decisions.md) -------------------------------------------------
+# The noise falls as a learned one was seen to fall, until flights are compared in groups; from there evenly to little.
 OURS = {
     "gae_lambda": "0:0.95 1:1",
     "target_kl": 0.05,
@@ -129,11 +130,11 @@ RECIPES = {
 
 
 def recipe(args):
-    """What ours changes for the environment of `args`; one without a recipe takes the first."""
+    """What our recipe changes for the environment of `args`; one without a recipe takes the first."""
     return RECIPES.get(args.env_id, RECIPES[ENV_IDS[0]])
 
 
-# Problem: what differs from the other scripts -------------------------------------------------------------------------
+# Problem: input and action --------------------------------------------------------------------------------------------
 ENV_IDS = ("DoubleIntegrator-v0", "DoubleIntegratorWaypoints-v0")
 ENV_OPTIONS = ("observe_phase", "observe_velocity")  # arguments of the environments
 FIXED_OPTIONS = {}  # those that no flag sets
@@ -159,7 +160,7 @@ def describe(episodes, metrics):
     return f"return {episodes['episodic_return'].mean():8.2f}  cost {episodes['cost'].mean():7.3f}  hits {hit}{ratio}"
 
 
-# Problem, ours: what only training changes, and what it is paid -------------------------------------------------------
+# Problem, ours: what only training changes ----------------------------------------------------------------------------
 def set_curriculum(envs, args, progress):
     """What only training changes, all of it ours; returns how many flights in a row have the same start.
 
@@ -176,11 +177,11 @@ def set_curriculum(envs, args, progress):
     return group
 
 
-def shape_rewards(envs, args, progress, batch, episodes):
+def add_rewards(envs, args, progress, batch, episodes):
     """Nothing: training is paid what the environment pays."""
 
 
-def prepare(agent, args, env_options):
+def before_training(agent, args, env_options):
     """Nothing: no constant of these problems is found by flying."""
 
 
@@ -311,7 +312,12 @@ LOG_STD_RANGE = (-8.0, 0.5)
 
 
 class Agent(nn.Module):
-    """Actor and critic on one GTrXL trunk. The Gaussian policy has one log-std for all states, learned or set."""
+    """Actor and critic on one GTrXL trunk. The Gaussian policy has one log-std for all states, learned or set.
+
+    A block's memory at step t is its own inputs of the steps t - L to t - 1, and m_0 before the first. A rollout keeps
+    them as keys and values (`encode_step`); training computes whole episodes anew from m_0 (`encode`). So lines 10, 11
+    and 17 need no stored m_t, and gradients flow over the window. Line 10's a_t does not enter: states tell it.
+    """
 
     def __init__(self, args, envs):
         super().__init__()
@@ -403,11 +409,11 @@ class Batch:
     actions: torch.Tensor  # (T, N, actions)
     logprobs: torch.Tensor  # (T, N)
     rewards: torch.Tensor  # (T, N), scaled
-    values: torch.Tensor  # (T, N), the critic's output
+    critic: torch.Tensor  # (T, N), its output; V of `returns_baseline` is made of it
     alive: torch.Tensor  # (T, N)
-    memory: torch.Tensor  # (blocks, N, L, d), m_0; encode recomputes the later memory, with gradients
+    memory: torch.Tensor  # (blocks, N, L, d), m_0
     advantages: torch.Tensor | None = None  # (T, N), set by train
-    returns: torch.Tensor | None = None  # (T, N), set by train: (returns - b) / c of `returns_baseline`
+    targets: torch.Tensor | None = None  # (T, N), set by train: what the critic learns
 
 
 @torch.no_grad()
@@ -420,7 +426,7 @@ def rollout(agent, envs, reward_scale, memory_noise):
         actions=zeros(T, N, *envs.single_action_space.shape),
         logprobs=zeros(T, N),  # set after the flight
         rewards=zeros(T, N),
-        values=zeros(T, N),  # set after the flight
+        critic=zeros(T, N),  # set after the flight
         alive=zeros(T, N),
         memory=agent.new_memory(N, memory_noise),  # line 5
     )
@@ -434,9 +440,10 @@ def rollout(agent, envs, reward_scale, memory_noise):
     for t in range(T):  # line 6
         batch.obs[t] = torch.as_tensor(next_obs)
         batch.alive[t] = torch.as_tensor(alive)
-        hidden[t] = agent.encode_step(batch.obs[t], cache, t)  # lines 7 and 10: of states, not of actions
+        hidden[t] = agent.encode_step(batch.obs[t], cache, t)  # lines 7 and 10
         batch.actions[t] = agent.get_policy(hidden[t]).sample()  # line 8
-        next_obs, reward, terminated, _, info = envs.step(batch.actions[t].cpu().numpy())  # line 9
+        # line 9; the horizon is a true end, because time is observed: nothing is truncated, nothing bootstrapped
+        next_obs, reward, terminated, _, info = envs.step(batch.actions[t].cpu().numpy())
         batch.rewards[t] = torch.as_tensor(reward * alive * reward_scale)
         ended = alive & terminated
         for key, value in info.get("final_info", {}).items():
@@ -446,7 +453,7 @@ def rollout(agent, envs, reward_scale, memory_noise):
         if not alive.any():
             break
 
-    batch.logprobs, _, batch.values = agent.evaluate_actions(hidden, batch.actions)  # v_t of line 8
+    batch.logprobs, _, batch.critic = agent.evaluate_actions(hidden, batch.actions)  # v_t of line 8
     of_each_process = runs.all_gather(episodes)
     all_episodes = {key: np.concatenate([part[key] for part in of_each_process]) for key in episodes}
     return batch, all_episodes
@@ -485,8 +492,8 @@ def explained_variance(prediction, returns, alive):
 def ppo_loss(agent, batch, mb, clip_coef, vf_coef, ent_coef):
     """-L_CLIP + c1 L_VF - c2 H over the living steps of the episodes `mb`; returns it and what is logged.
 
-    The paper's sum with the sign that raises L_CLIP, and L_VF = 1/2 (V - R)^2. Under torchrun the loss is this
-    process's part of the mean (the gradients are then summed), what is logged is of all.
+    The paper's sum with the sign that raises L_CLIP, and L_VF = 1/2 (critic - target)^2. Under torchrun the loss is
+    this process's part of the mean (the gradients are then summed), what is logged is of all.
     """
     alive = batch.alive[:, mb]
     advantages = batch.advantages[:, mb]
@@ -505,7 +512,7 @@ def ppo_loss(agent, batch, mb, clip_coef, vf_coef, ent_coef):
     pg_loss = mean(torch.max(-advantages * ratio, -advantages * clipped))
 
     # value loss, L_VF
-    v_loss = mean(0.5 * (newvalue - batch.returns[:, mb]) ** 2)
+    v_loss = mean(0.5 * (newvalue - batch.targets[:, mb]) ** 2)
 
     entropy_loss = mean(entropy)
     loss = pg_loss - ent_coef * entropy_loss + vf_coef * v_loss
@@ -533,29 +540,34 @@ def at(schedule, progress):
     return float(np.interp(progress, places, values))
 
 
-def set_noise(agent, args, progress):
-    """Set the log-std where it is not learned; returns the learning rate of this update.
-
-    Two Gaussians of one std whose means differ by d have a KL divergence of d^2 / (2 std^2). The less noise, the
-    further an optimiser's step of fixed size moves the policy. With a rate in proportion to the std it moves it equally
-    far at any noise, so that the noise can fall by a factor of hundreds and the policy still learns.
-    """
+def set_log_std(agent, args, progress):
+    """Set the log-std of this update, where points of --log-std set it; keep a learned one where it has a gradient."""
     if agent.actor_logstd.requires_grad:
         agent.actor_logstd.data.clamp_(*LOG_STD_RANGE)  # beyond it get_policy's clamp leaves no gradient
     else:
         agent.actor_logstd.data.fill_(at(args.log_std, progress))
+
+
+def learning_rate_of(agent, args, progress):
+    """The learning rate of this update; with --lr-times-std in proportion to the policy's standard deviation.
+
+    Means that differ by delta have a KL divergence of delta^2 / (2 std^2), and a step of Adam moves the mean by about
+    the learning rate, whatever the std. With a rate in proportion to it a step has the same KL at any noise. So the
+    noise can fall by a factor of hundreds, and the policy still learns.
+    """
     learning_rate = at(args.learning_rate, progress)
-    if args.lr_times_std:
-        learning_rate *= agent.actor_logstd.exp().mean().item()
-    return learning_rate
+    if not args.lr_times_std:
+        return learning_rate
+    return learning_rate * agent.actor_logstd.exp().mean().item()
 
 
 def linear_fit(x, y, alive):
     """Ridge regression of y (..., G) on x (..., G, k) over the G episodes of a group that live: the fitted y.
 
-    Each episode is in its own fit. This shrinks its residual by the factor 1 - l, where l is its leverage. l depends
-    on the states at this step, not on the action: a state's gradient keeps its direction, and extreme states count
-    less. (A fit without it was worse: docs/training-notes.md.)
+    Each episode is in its own fit, which shrinks its residual by the factor 1 - l, its leverage l. With lambda = 1 this
+    keeps the direction of a state's expected gradient, because l depends on the states at this step and not on the
+    action; extreme states count less. With a smaller lambda that is approximate. (Fits that leave the episode out were
+    worse: docs/training-notes.md.)
     """
     x, y = x.double(), y.double()[..., None]
     weight = alive.double()[..., None]  # (..., G, 1)
@@ -570,11 +582,12 @@ def linear_fit(x, y, alive):
 
 
 def returns_baseline(batch, gamma, group):
-    """b (T, N) and c (T, 1) of the value V(s, t) = b + c critic(s, t); with group 1 the paper's, b = 0 and c = 1.
+    """b (T, N) and c (T, 1) of the value V(s_t) = b_t + c_t critic(s_t). The paper's: b = 0, c = 1; so with group 1.
 
     Each `group` of episodes that follow one another flew the same start. b regresses their returns from step t on
-    linearly on the states that they have reached by then, c is the spread of what is left. With small noise a critic's
-    error is larger than what an action changes; comparing flights of one start shows what an action changes.
+    linearly on the states that they have reached by then. c is the spread of what is left at step t, over all flights,
+    and 0.3 of its mean over the steps, added as squares: without it steps of hardly any spread would be blown up. With
+    small noise a critic's error is larger than what an action changes; comparing flights of one start shows it.
 
     Relatives: the mean return of other samples of the same question as the baseline (RLOO, Kool et al. 2019), or of the
     whole group, in units of its spread (GRPO, Shao et al. 2024). They have one return a sample, we one a step; hence
@@ -582,15 +595,15 @@ def returns_baseline(batch, gamma, group):
     """
     if group == 1:
         return torch.zeros_like(batch.rewards), torch.ones_like(batch.rewards[:, :1])
-    no_values = torch.zeros_like(batch.values)
-    returns, _ = gae(batch.rewards, no_values, batch.alive, gamma, 1.0)  # Monte-Carlo
+    no_values = torch.zeros_like(batch.critic)
+    monte_carlo, _ = gae(batch.rewards, no_values, batch.alive, gamma, 1.0)
     obs = batch.obs.unflatten(1, (-1, group))
-    grouped_returns = returns.unflatten(1, (-1, group))
+    grouped_returns = monte_carlo.unflatten(1, (-1, group))
     alive = batch.alive.unflatten(1, (-1, group))
     baseline = linear_fit(obs, grouped_returns, alive).flatten(1)
-    _, variance = moments(returns - baseline, batch.alive, 1)
-    floor = 0.3 * variance.sqrt().mean()  # for steps of next to no spread; steps after every end count as zeros
-    return baseline, (variance + floor**2 + 1e-8).sqrt()
+    _, variance = moments(monte_carlo - baseline, batch.alive, 1)
+    mean_spread = variance.sqrt().mean()  # steps that no flight reaches count as zeros
+    return baseline, (variance + (0.3 * mean_spread) ** 2 + 1e-8).sqrt()
 
 
 # Shared: training (Algorithm 1) and main ------------------------------------------------------------------------------
@@ -605,19 +618,21 @@ def train(args, agent, average, optimizer, envs, run):
         memory_noise = at(args.memory_noise, progress)
         gae_lambda = at(args.gae_lambda, progress)
         ent_coef = at(args.ent_coef, progress)
-        learning_rate = set_noise(agent, args, progress)
+        set_log_std(agent, args, progress)
+        learning_rate = learning_rate_of(agent, args, progress)
         optimizer.param_groups[0]["lr"] = learning_rate
-        group = set_curriculum(envs, args, progress)
+        group = set_curriculum(envs, args, progress)  # ours
 
         # lines 3-13: fly one episode in every environment
         batch, episodes = rollout(agent, envs, args.reward_scale, memory_noise)
-        shape_rewards(envs, args, progress, batch, episodes)
+        add_rewards(envs, args, progress, batch, episodes)  # ours
 
-        # line 14: advantages, and what the critic learns
-        baseline, scale = returns_baseline(batch, args.gamma, group)
-        values = baseline + scale * batch.values
+        # line 14: returns and advantages
+        baseline, scale = returns_baseline(batch, args.gamma, group)  # ours; 0 and 1 with group 1
+        values = baseline + scale * batch.critic
         advantages, returns = gae(batch.rewards, values, batch.alive, args.gamma, gae_lambda)
-        batch.advantages, batch.returns = advantages, (returns - baseline) / scale
+        batch.targets = (returns - baseline) / scale
+        batch.advantages = advantages
         if args.norm_adv:
             mean, variance = moments(advantages, batch.alive, (0, 1))
             batch.advantages = (advantages - mean) / (variance.sqrt() + 1e-8)
@@ -637,12 +652,12 @@ def train(args, agent, average, optimizer, envs, run):
                 gradient_norm = nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
                 runs.refuse_nan({**losses, "gradient norm": gradient_norm}, epoch, minibatch)
                 optimizer.step()
-                average.update_parameters(agent)
+                average.update_parameters(agent)  # ours: what evaluation flies
             if losses["approx_kl"] > target_kl:
                 break  # the minibatch that went too far has taken no step, and ends the update
 
         means = {name: torch.stack([logged[name] for logged in log]).mean().item() for name in losses}
-        means["explained_variance"] = explained_variance(batch.values, batch.returns, batch.alive)
+        means["explained_variance"] = explained_variance(batch.critic, batch.targets, batch.alive)
         means["baseline_explained_variance"] = explained_variance(baseline, returns, batch.alive)
 
         run.end_update(iteration, batch.alive, episodes, means, learning_rate)
@@ -655,7 +670,7 @@ def main(argv):
     envs = runs.make_envs(args, env_options)
     agent = Agent(args, envs).to(device)
     runs.load_checkpoint(agent, args, saved)
-    prepare(agent, args, env_options)
+    before_training(agent, args, env_options)
     average = AveragedModel(agent, multi_avg_fn=get_ema_multi_avg_fn(args.weight_average))
     optimizer = torch.optim.Adam(agent.parameters(), eps=1e-5, fused=True)  # train sets its learning rate
     run = runs.Run(

@@ -3,12 +3,12 @@
     python ppo_gtrxl_rocket.py --seed 1                                 # the paper's 961 s, as results/rocket_fixed
     python ppo_gtrxl_rocket.py --seed 1 --env-id RocketAscentCutoff-v0  # free final time
     python ppo_gtrxl_rocket.py --seed 1 --env-id RocketAscentCutoff-v0 --dispersion 1    # every flight another vehicle
-    python ppo_gtrxl_rocket.py --seed 1 --recipe paper                  # Table 1 as printed
+    python ppo_gtrxl_rocket.py --seed 1 --recipe paper                  # plain PPO with Table 1
     python ppo_gtrxl_rocket.py --eval-only --checkpoint results/rocket_fixed/agent.safetensors
 
 Top to bottom: arguments, recipes, problem, Gated Transformer-XL, agent, PPO, what we add to it, training, main.
-From the first "Shared" on, all ppo_gtrxl_*.py are the same to the letter. T steps, N environments, L memory, d width,
-H heads.
+From the first "Shared" on, all ppo_gtrxl_*.py are the same to the letter. "Ours" is what the paper does not have.
+T steps, N environments (Algorithm 1: E), L memory length, d width, H heads, dk = d / H.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -32,14 +33,16 @@ from rocket.rewards import TERMINAL_SCALE, mass_rewards
 from runs import Schedule, all_reduce_sum
 
 
+# A schedule is a number, or "place:value place:value": place 0 is the first update, 1 the last; linear between the
+# points, constant before the first and after the last. Two points at one place are a jump.
 @dataclass
 class Args:
-    """The paper: Table 1's column of this problem, and what it leaves open. RECIPES has what we change."""
+    """The arguments; by default Table 1's column of this problem. RECIPES has what we change."""
 
     # experiment
     exp_name: str = Path(__file__).stem  # the name of this experiment
     seed: int = 1  # seed of the experiment
-    recipe: str = "ours"  # what no flag sets: ours (RECIPES) or paper (Table 1 and nothing of ours in the learning)
+    recipe: str = "ours"  # what no flag sets: ours (RECIPES) or paper (plain PPO with Table 1, as the defaults below)
     torch_deterministic: bool = True  # if toggled, `torch.backends.cudnn.deterministic=True`
     cuda: bool = True  # if toggled, a GPU is used when there is one
     num_threads: int = 1  # CPU threads of torch (0: torch's own choice); bits depend on it
@@ -52,7 +55,7 @@ class Args:
     checkpoint: str | None = None  # start from these weights (.safetensors)
     resume: str | None = None  # run folder of an interrupted run to go on with, bit for bit
     eval_only: bool = False  # fly the mean action of --checkpoint, train nothing, write only --eval-json and --eval-npz
-    eval_starts: int | None = None  # flights of the evaluation with --dispersion (default: 1705; cut short: 100)
+    eval_starts: int | None = None  # drawn flights of the evaluation (default: 1705; of a training cut short: 100)
     eval_seed: int = 0  # seed of the evaluation starts
     eval_json: str | None = None  # where --eval-only writes the metrics
     eval_npz: str | None = None  # where --eval-only writes the trajectories
@@ -64,46 +67,44 @@ class Args:
     dispersion: float = 0.0  # size of the draws of vehicle and air: 0 none, 1 the table `envs.Dispersion`
     observe_draw: bool = False  # show the draw to the policy: an oracle
     observe_mass: bool = False  # show the true mass of a dispersed rocket, not the flight computer's
-    reward_scale: float = 0.2  # factor on the rewards in training; everything logged is unscaled
 
-    # transformer (Table 1)
+    # Table 1
     num_blocks: int = 6  # number of GTrXL blocks (0: a plain MLP, without memory)
     embed_dim: int = 384  # embedding dimension d
     num_heads: int = 8  # number of attention heads
     memory_length: int = 256  # memory length L: a step attends to itself and the L steps before it
     mlp_dim: int = 384  # width of the position-wise MLP
     hidden_dim: int = 384  # width of the hidden layer of each head
-    memory_noise: Schedule = 0.1  # spread of the memory before an episode (Algorithm 1, line 5: "small")
-
-    # PPO (Table 1 where it has a row; docs/decisions.md has the rest)
-    total_updates: int = 5000  # number of updates
-    num_envs: int = 32  # parallel environments, one episode each per update
-    learning_rate: Schedule = "0:1e-4 1:5e-6"  # the learning rate of the optimizer
     gamma: float = 0.99  # the discount factor gamma
     gae_lambda: Schedule = 0.95  # the lambda for the general advantage estimation
-    num_minibatches: int = 8  # the number of mini-batches of whole episodes
+    total_updates: int = 5000  # number of updates
     update_epochs: int = 16  # the K epochs to update the policy
-    norm_adv: bool = True  # normalise the advantages over an update
-    clip_coef: float = 0.12  # the surrogate clipping coefficient
-    ent_coef: Schedule = "0:1e-3 1:1e-4"  # coefficient of the entropy
     vf_coef: float = 0.8  # coefficient of the value function
+    learning_rate: Schedule = "0:1e-4 1:5e-6"  # the learning rate of the optimizer
+    ent_coef: Schedule = "0:1e-3 1:1e-4"  # coefficient of the entropy
+    clip_coef: float = 0.12  # the surrogate clipping coefficient
+
+    # not in Table 1: our choice
+    num_envs: int = 32  # parallel environments, one episode each per update
+    num_minibatches: int = 8  # the number of mini-batches of whole episodes
+    norm_adv: bool = True  # normalise the advantages over an update
     max_grad_norm: float = 0.5  # the maximum norm for the gradient clipping
     target_kl: float | None = None  # the KL divergence from which an update takes no further step (none: no limit)
-    log_std: Schedule = -1.4  # log of the std in the unit of the action: a number, learned from there; points, set
+    log_std: Schedule = -1.4  # log of the std in the action's unit. A number: learned from there; points: set
+    memory_noise: Schedule = 0.1  # std of the memory before an episode (Algorithm 1, line 5; the text says "small")
+    reward_scale: float = 0.2  # factor on the rewards in training; everything logged is unscaled
 
     # ours: off here, on in RECIPES
-    lr_times_std: bool = False  # multiply the learning rate by the policy's std
+    lr_times_std: bool = False  # the learning rate is --learning-rate times the policy's std
     flights_per_start: Schedule = 1  # flights of each start or draw, compared with one another
-    guidance: bool = False  # charge for leaving a pitch programme until 150.4 s (R_guidance)
-    mass_weight: Schedule = 0.0  # cut-off: factor on `mass_rewards`, which compare 8 or more flights
+    guidance: bool = False  # pay R_guidance: the paper's, our form of it (rocket/rewards.py)
+    mass_weight: Schedule = 0.0  # cut-off: factor on `mass_rewards`, which compare flights of one start
     weight_average: float = 0.0  # decay, per optimiser step, of the averaged weights used in evaluation
 
 
-# Recipes: what ours changes -------------------------------------------------------------------------------------------
-# A schedule is "place:value place:value": 0 is the first update, 1 the last, linear in between. There is one start, so
-# all flights of an update are compared from the first update on. The network is a hundred times smaller than Table 1's.
+# Recipes: the values of Args that we replace (why: docs/decisions.md) -------------------------------------------------
 OURS = {
-    "num_blocks": 2,
+    "num_blocks": 2,  # a laptop's network, a hundredth of Table 1's weights
     "embed_dim": 64,
     "num_heads": 4,
     "memory_length": 32,
@@ -118,25 +119,25 @@ OURS = {
     "ent_coef": 0.0,
     "vf_coef": 0.5,
     "target_kl": 0.02,
-    "flights_per_start": 32,
+    "flights_per_start": 32,  # there is one start: all flights of an update are compared
 }
 CUTOFF = {
     **OURS,
-    "total_updates": 380,
+    "total_updates": 340,
     "memory_noise": "0:0.01 1:0",
-    "log_std": "0:-1 1:-7.4",
-    "mass_weight": "0.1:0 0.2:2 0.5:2 0.85:0",
+    "log_std": "0:-1 0.85:-6.4 1:-8",
+    "mass_weight": "0.1:0 0.2:2 0.5:2 0.85:0",  # not before the orbit is reached; at the end the orbit alone counts
     "weight_average": 0.998,
 }
 FIXED = {
     **OURS,
     "total_updates": 500,
     "memory_noise": "0:0.1 1:0",
-    "log_std": "0:-1 1:-6",
+    "log_std": "0:-1 0.85:-5.2 1:-7",
     "guidance": True,
     "weight_average": 0.99,
 }
-DISPERSED = {  # goes on with a policy of the nominal flight
+DISPERSED = {  # replaces more, and goes on with a policy of the nominal flight
     "total_updates": 150,
     "num_envs": 64,
     "flights_per_start": 16,
@@ -147,7 +148,7 @@ DISPERSED = {  # goes on with a policy of the nominal flight
     "weight_average": 0.998,
 }
 RECIPES = {"RocketAscent-v0": FIXED, "RocketAscentCutoff-v0": CUTOFF, "TwoStageLEO-v0": CUTOFF}
-NOMINAL = {  # the policy with which a dispersed training begins
+FIRST_POLICY = {  # with which a dispersed training begins
     "RocketAscent-v0": "results/rocket_fixed/agent.safetensors",
     "RocketAscentCutoff-v0": "results/rocket_cutoff/agent.safetensors",
     "TwoStageLEO-v0": "results/two_stage_leo/agent.safetensors",
@@ -155,19 +156,22 @@ NOMINAL = {  # the policy with which a dispersed training begins
 
 
 def recipe(args):
-    """What ours changes for the environments of `args`: an id without a recipe takes that of its family."""
+    """What our recipe changes for the environments of `args`; an id without a recipe takes its family's."""
     family = CUTOFF if ROCKETS[args.env_id].cutoff else FIXED
-    nominal = RECIPES.get(args.env_id, family)
+    changes = RECIPES.get(args.env_id, family)
     if not args.dispersion:
-        return nominal
-    first_policy = args.checkpoint or NOMINAL.get(args.env_id)
+        return changes
+    first_policy = args.checkpoint or FIRST_POLICY.get(args.env_id)
     if first_policy is None:
-        print("--dispersion without a policy to begin with: train one without dispersion, and name it by --checkpoint")
-        return nominal
-    return {**nominal, **DISPERSED, "checkpoint": first_policy}
+        todo = "train without --dispersion first, and name that policy by --checkpoint"
+        print(f"--dispersion: no policy of {args.env_id} to begin with, so this training begins anew; better {todo}")
+        return {**changes, "num_envs": DISPERSED["num_envs"], "flights_per_start": DISPERSED["flights_per_start"]}
+    return {**changes, **DISPERSED, "checkpoint": first_policy}
 
 
-# Problem: what differs from the other scripts -------------------------------------------------------------------------
+# Problem: input and action --------------------------------------------------------------------------------------------
+# The reward is R_orbital + R_trajectory + R_guidance + R_penalties + R_terminal (rocket/rewards.py). The paper names
+# the five without formulas. R_trajectory has no weight here, R_guidance only with --guidance.
 ENV_IDS = tuple(ROCKETS)
 ENV_OPTIONS = ("observe_phase", "dispersion", "observe_draw", "observe_mass")  # arguments of the environments
 FIXED_OPTIONS = {"action_frame": "local"}  # those that no flag sets: up, along-track, cross-track
@@ -175,59 +179,70 @@ BUFFERS = {env_id: policy_constants(mission.rocket) for env_id, mission in ROCKE
 INITIAL_ACTION = [1.0, 0.0, 0.0]  # straight up (local frame): a randomly steered rocket never leaves the ground
 
 
-LENGTH = 64  # the Earth's radius in 100 km, rounded
-SPEED = 8  # the circular speed there in km/s, rounded
+OBSERVED = 9  # numbers that every rocket shows: r, v, m, t_norm, phase; the draw comes after them
+LENGTH = 64  # an Earth radius is about so many 100 km
+SPEED = 8  # its circular speed is about so many km/s
+
+
+class Motion(NamedTuple):
+    """Where a flight is, (..., k) each; unless said otherwise in Earth radii and circular speeds, which make mu = 1."""
+
+    r: torch.Tensor  # (..., 3) in the target orbit's axes: to the perigee, along the semi-latus rectum, normal
+    v: torch.Tensor  # (..., 3) in the same axes
+    altitude: torch.Tensor  # (..., 1) 100 km
+    climb: torch.Tensor  # (..., 1) km/s
+    out_of_plane: torch.Tensor  # (..., 2) 100 km and km/s
+    speed: torch.Tensor  # (..., 1)
+    energy: torch.Tensor  # (..., 1) v^2 / 2 - 1 / r
+    error: torch.Tensor  # (..., 6) [(h - h_T) / |h_T|, e - e_T]: angular momentum and eccentricity vector, T the target
+    log_mass: torch.Tensor  # (..., 1) of m / dry mass
+    angle: torch.Tensor  # (..., 1) rad from the perigee
 
 
 def motion(agent, obs):
-    """Position, velocity (..., 3) and specific energy (...) in the target orbit's axes and units, and more (..., 7).
-
-    The units are the Earth's radius and the circular speed there. The seven quantities are those that flights are
-    compared by.
-    """
+    """The Motion of observations (..., 9 or more)."""
     r, v, mass = (obs[..., :7] / agent.units).split([3, 3, 1], dim=-1)
-    r, v = r @ agent.axes.T, v @ agent.axes.T  # towards the perigee, along the semi-latus rectum, normal to the plane
+    r, v = r @ agent.axes.T, v @ agent.axes.T
     radius = r.norm(dim=-1, keepdim=True)
-    altitude = LENGTH * (radius - 1)
-    climb = SPEED * (r * v).sum(dim=-1, keepdim=True) / radius
-    out_of_plane = LENGTH * r[..., 2:]
-    out_of_plane_speed = SPEED * v[..., 2:]
-    speed = v.norm(dim=-1, keepdim=True)  # as it is, in circular speeds
-    angle = torch.atan2(r[..., 1:2], r[..., :1])
-    energy = speed[..., 0] ** 2 / 2 - 1 / radius[..., 0]  # -1 / (2 a)
-    compared = [altitude, climb, out_of_plane, out_of_plane_speed, speed, mass.log(), angle]
-    return r, v, energy, torch.cat(compared, dim=-1)
+    speed = v.norm(dim=-1, keepdim=True)
+    h = torch.linalg.cross(r, v)
+    e = torch.linalg.cross(v, h) - r / radius
+    return Motion(
+        r=r,
+        v=v,
+        altitude=LENGTH * (radius - 1),
+        climb=SPEED * (r * v).sum(dim=-1, keepdim=True) / radius,
+        out_of_plane=torch.cat([LENGTH * r[..., 2:], SPEED * v[..., 2:]], dim=-1),
+        speed=speed,
+        energy=speed**2 / 2 - 1 / radius,
+        error=torch.cat([(h - agent.h_target) / agent.h_target.norm(), e - agent.e_target], dim=-1),
+        log_mass=mass.log(),
+        angle=torch.atan2(r[..., 1:2], r[..., :1]),
+    )
 
 
 def features(agent, obs):
-    """What the encoder sees (..., inputs) of observations (..., 9 or more); every feature is ours. In this order:
+    """What the encoder sees (..., inputs) of observations (..., 9 or more). Every feature is ours, in this order:
 
-    - position r and velocity v in the target orbit's axes; altitude, climb rate, out-of-plane position and speed,
-      speed (`motion`)
-    - the share of the time that is left, the logarithm of the mass, the phase one-hot
-    - the orbit's error, [(h - h_T) / |h_T|, e - e_T] with h = r x v and e = v x h - r / |r| (mu = 1), and
-      tanh(10 error), in which small errors show
+    - position and velocity, altitude, climb, position and speed out of the plane, speed (`Motion`)
+    - the share of the time that is left, log mass, the phase one-hot
+    - the orbit's error, and tanh(10 error), in which small errors show
     - the draw, with --observe-draw
-    - `motion`'s seven quantities less those of the nominal flight at the same energy (`nominal_at`), in units of
-      `differences`, clipped at 10 (a sum of such differences tells where the perigee will be; tanh would flatten them);
+    - what the flight differs by from the nominal one, in units of `differences`, clipped at 10 (tanh would flatten it);
       zeros before a dispersed training
 
-    The paper's observation, and ours, is r and v in ECI, m, t_norm and the phase.
+    The paper gives the environment's observation alone: r and v in ECI, m, t_norm and the phase.
     """
-    r, v, energy, compared = motion(agent, obs)
-    altitude_to_speed, log_mass = compared[..., :5], compared[..., 5:6]
-    time_left, phase, draw = obs[..., 7:8], obs[..., 8:9], obs[..., 9:]
+    m = motion(agent, obs)
+    time_left, phase, draw = obs[..., 7:8], obs[..., 8:9], obs[..., OBSERVED:]
     one_hot = ((phase - agent.phases).abs() < 1e-3).to(obs.dtype)  # phase: 0 to 1 (the paper's 0 to 3)
 
-    h = torch.linalg.cross(r, v)
-    e = torch.linalg.cross(v, h) - r / r.norm(dim=-1, keepdim=True)
-    error = torch.cat([(h - agent.h_target) / agent.h_target.norm(), e - agent.e_target], dim=-1)
-
-    burn = one_hot.argmax(dim=-1).to(obs.dtype)
-    differs = (compared - nominal_at(agent, burn, energy)) / agent.differences
+    differs = (compared(m) - nominal_at(agent, phase, m.energy)) / agent.differences
     differs = torch.where(agent.nominal_flight.any(), differs.clamp(-10, 10), 0.0)
 
-    seen = [r, v, altitude_to_speed, time_left, log_mass, one_hot, error, (10 * error).tanh(), draw, differs]
+    seen = [m.r, m.v, m.altitude, m.climb, m.out_of_plane, m.speed, time_left, m.log_mass, one_hot]
+    seen += [m.error, (10 * m.error).tanh()]
+    seen += [draw, differs]  # last: `before_training` clears their weights
     return torch.cat(seen, dim=-1)
 
 
@@ -245,32 +260,32 @@ def describe(episodes, metrics):
     return f"{line}  mean action: error {metrics['error_norm']:.6f}  {orbit}  mass {metrics['final_mass_kg']:.1f} kg"
 
 
-# Problem, ours: what only training changes, and what it is paid -------------------------------------------------------
+# Problem, ours: what only training changes ----------------------------------------------------------------------------
 def set_curriculum(envs, args, progress):
-    """What only training changes, all of it ours; returns how many flights in a row have the same start, or draw.
+    """What only training changes; returns how many flights in a row have the same start, or draw.
 
-    The noise scatters the ends of the flights by about std / 10, so R_terminal's scale follows it once it is small.
-    On dispersed flights the scale is at least 0.001 (smaller was no better). A learned noise leaves it as it is.
+    The scale of R_terminal follows a noise that is set: std / 8, at most TERMINAL_SCALE, on dispersed flights at least
+    0.001 (smaller was no better). The noise scatters the ends of the flights by about std / 10.
     """
-    std = math.exp(at(args.log_std, progress))
-    smallest = 0.001 if args.dispersion else 0.0
-    envs.terminal_scale = min(TERMINAL_SCALE, max(std / 8, smallest))
+    envs.terminal_scale = TERMINAL_SCALE
+    if isinstance(args.log_std, str):
+        std = math.exp(at(args.log_std, progress))
+        smallest = 0.001 if args.dispersion else 0.0
+        envs.terminal_scale = min(TERMINAL_SCALE, max(std / 8, smallest))
     envs.guidance = args.guidance
     envs.flights_per_start = round(at(args.flights_per_start, progress))
     return envs.flights_per_start
 
 
-def shape_rewards(envs, args, progress, batch, episodes):
-    """With cut-off, pay a flight's last step its `mass_rewards`. Ours.
-
-    They cannot matter before the flights reach their orbit; at the end the orbit alone counts.
-    """
+def add_rewards(envs, args, progress, batch, episodes):
+    """With cut-off, add `mass_rewards` to the flights' last steps."""
     if not envs.cutoff:
         return
     weight = at(args.mass_weight, progress)
     if weight == 0:
         return
-    group_size = envs.flights_per_start if args.dispersion else len(episodes["error"])
+    one_start = len(episodes["error"])  # without dispersion all flights, of all processes, are one group
+    group_size = envs.flights_per_start if args.dispersion else one_start
     paid = weight * mass_rewards(episodes, envs.rocket, envs.terminal_scale, group_size)
     paid = runs.local_shard(paid, envs.num_envs)  # of this process's flights
     last_step = batch.alive.sum(0).long() - 1  # (N,)
@@ -278,36 +293,46 @@ def shape_rewards(envs, args, progress, batch, episodes):
     batch.rewards[last_step, flight] += torch.as_tensor(paid * args.reward_scale).to(batch.rewards)
 
 
-def nominal_at(agent, burn, energy):
-    """`motion`'s seven quantities (..., 7) of the nominal flight in this burn (...) at this energy (...).
+# Problem, ours: the nominal flight, beside which dispersed ones are seen ----------------------------------------------
+def compared(m):
+    """What flights are compared by (..., 8): the orbit's error, log mass and angle of a `Motion`."""
+    return torch.cat([m.error, m.log_mass, m.angle], dim=-1)
 
-    Two vehicles in the same burn at the same energy are as far on their way, whatever their clocks say. Between the
-    rows of `nominal_flight`, each of one step, the quantities are linear, and beyond a burn's rows they go on so.
+
+def nominal_at(agent, phase, energy):
+    """The nominal flight's `compared` (..., 8) in a phase at an energy (..., 1) each.
+
+    At one energy of one burn two flights are equally far on their way, whatever the time, and what still has to be
+    added to their orbits is nearly the same. So what their orbits differ by here they will differ by at the end.
+    Linear between the rows of `nominal_flight`, one a step, and extrapolated beyond those of a burn.
     """
-    burns, energies, flight = agent.nominal_flight.split([1, 1, 7], dim=-1)
-    burns, energies = burns[:, 0].contiguous(), energies[:, 0].contiguous()
-    first = torch.searchsorted(burns, burn)
-    last = torch.searchsorted(burns, burn, right=True) - 1
-    after = torch.searchsorted(burns + energies, burn + energy)  # energies are in -1 to 0: burns do not overlap
-    after = torch.minimum(torch.maximum(after, first + 1), last).clamp(min=1)
-    before = after - 1
-    share = (energy - energies[before]) / (energies[after] - energies[before]).clamp(min=1e-7)
-    return torch.lerp(flight[before], flight[after], share[..., None])
+    rows = agent.nominal_flight
+    burn = (phase * (len(agent.phases) - 1)).round().contiguous()
+    key = (burn + energy).contiguous()
+    burns, energies = rows[:, 0].contiguous(), rows[:, 1].contiguous()
+    first_of_burn = torch.searchsorted(burns, burn)
+    last_of_burn = torch.searchsorted(burns, burn, right=True) - 1
+    after = torch.searchsorted(burns + energies, key)  # sorted: energies rise within a burn, from -1 to 0
+    after = torch.minimum(torch.maximum(after, first_of_burn + 1), last_of_burn).clamp(min=1)[..., 0]
+    share = (energy - rows[after - 1, 1:2]) / (rows[after, 1:2] - rows[after - 1, 1:2]).clamp(min=1e-7)
+    return torch.lerp(rows[after - 1, 2:], rows[after, 2:], share)
 
 
 @torch.no_grad()
-def prepare(agent, args, env_options):
-    """Before a dispersed training: fly the nominal rocket once by the policy that it begins with, and keep the flight.
+def before_training(agent, args, env_options):
+    """Where a dispersed training begins with a policy of the nominal flight: let it fly that flight, and keep it.
 
-    The weights of what depends on it, and of the draw, begin at zero, so that the policy is the same at first.
+    The weights on what is new to the policy, the draw and the differences, begin at zero: at first it flies as before.
     """
-    begins_with_a_policy = args.checkpoint is not None and args.resume is None and not args.eval_only
-    if not (args.dispersion and begins_with_a_policy) or agent.nominal_flight.any():
+    begins = args.checkpoint is not None and args.resume is None and not args.eval_only
+    if not (begins and args.dispersion):
         return
+    if agent.nominal_flight.any():
+        return  # that policy has its nominal flight
     envs = gym.make_vec(args.env_id, num_envs=1, **{**env_options, "dispersion": 0.0})
     fly_nominal(agent, agent.make_policy(envs.episode_steps), envs)
-    new_inputs = len(DIFFERENCES) + envs.single_observation_space.shape[0] - 9
-    agent.encoder[0].weight[:, -new_inputs:] = 0.0
+    draw = envs.single_observation_space.shape[0] - OBSERVED
+    agent.encoder[0].weight[:, -(draw + len(DIFFERENCES)) :] = 0.0
 
 
 def fly_nominal(agent, policy, envs):
@@ -320,11 +345,11 @@ def fly_nominal(agent, policy, envs):
         flight.append(obs)
 
     obs = torch.as_tensor(np.concatenate(flight)).to(agent.nominal_flight)
-    _, _, energy, compared = motion(agent, obs)
+    m = motion(agent, obs)
     rows = agent.nominal_flight[: len(obs)]
     rows[:, 0] = (obs[:, 8] * (len(agent.phases) - 1)).round()
-    rows[:, 1] = energy.cummax(dim=0).values
-    rows[:, 2:] = compared
+    rows[:, 1] = m.energy[:, 0].cummax(dim=0).values  # rounding alone can lower it while engines burn
+    rows[:, 2:] = compared(m)
     agent.nominal_flight[len(obs) :, 0] = len(agent.phases)  # after its end: a burn that there is not
 
 
@@ -455,7 +480,12 @@ LOG_STD_RANGE = (-8.0, 0.5)
 
 
 class Agent(nn.Module):
-    """Actor and critic on one GTrXL trunk. The Gaussian policy has one log-std for all states, learned or set."""
+    """Actor and critic on one GTrXL trunk. The Gaussian policy has one log-std for all states, learned or set.
+
+    A block's memory at step t is its own inputs of the steps t - L to t - 1, and m_0 before the first. A rollout keeps
+    them as keys and values (`encode_step`); training computes whole episodes anew from m_0 (`encode`). So lines 10, 11
+    and 17 need no stored m_t, and gradients flow over the window. Line 10's a_t does not enter: states tell it.
+    """
 
     def __init__(self, args, envs):
         super().__init__()
@@ -547,11 +577,11 @@ class Batch:
     actions: torch.Tensor  # (T, N, actions)
     logprobs: torch.Tensor  # (T, N)
     rewards: torch.Tensor  # (T, N), scaled
-    values: torch.Tensor  # (T, N), the critic's output
+    critic: torch.Tensor  # (T, N), its output; V of `returns_baseline` is made of it
     alive: torch.Tensor  # (T, N)
-    memory: torch.Tensor  # (blocks, N, L, d), m_0; encode recomputes the later memory, with gradients
+    memory: torch.Tensor  # (blocks, N, L, d), m_0
     advantages: torch.Tensor | None = None  # (T, N), set by train
-    returns: torch.Tensor | None = None  # (T, N), set by train: (returns - b) / c of `returns_baseline`
+    targets: torch.Tensor | None = None  # (T, N), set by train: what the critic learns
 
 
 @torch.no_grad()
@@ -564,7 +594,7 @@ def rollout(agent, envs, reward_scale, memory_noise):
         actions=zeros(T, N, *envs.single_action_space.shape),
         logprobs=zeros(T, N),  # set after the flight
         rewards=zeros(T, N),
-        values=zeros(T, N),  # set after the flight
+        critic=zeros(T, N),  # set after the flight
         alive=zeros(T, N),
         memory=agent.new_memory(N, memory_noise),  # line 5
     )
@@ -578,9 +608,10 @@ def rollout(agent, envs, reward_scale, memory_noise):
     for t in range(T):  # line 6
         batch.obs[t] = torch.as_tensor(next_obs)
         batch.alive[t] = torch.as_tensor(alive)
-        hidden[t] = agent.encode_step(batch.obs[t], cache, t)  # lines 7 and 10: of states, not of actions
+        hidden[t] = agent.encode_step(batch.obs[t], cache, t)  # lines 7 and 10
         batch.actions[t] = agent.get_policy(hidden[t]).sample()  # line 8
-        next_obs, reward, terminated, _, info = envs.step(batch.actions[t].cpu().numpy())  # line 9
+        # line 9; the horizon is a true end, because time is observed: nothing is truncated, nothing bootstrapped
+        next_obs, reward, terminated, _, info = envs.step(batch.actions[t].cpu().numpy())
         batch.rewards[t] = torch.as_tensor(reward * alive * reward_scale)
         ended = alive & terminated
         for key, value in info.get("final_info", {}).items():
@@ -590,7 +621,7 @@ def rollout(agent, envs, reward_scale, memory_noise):
         if not alive.any():
             break
 
-    batch.logprobs, _, batch.values = agent.evaluate_actions(hidden, batch.actions)  # v_t of line 8
+    batch.logprobs, _, batch.critic = agent.evaluate_actions(hidden, batch.actions)  # v_t of line 8
     of_each_process = runs.all_gather(episodes)
     all_episodes = {key: np.concatenate([part[key] for part in of_each_process]) for key in episodes}
     return batch, all_episodes
@@ -629,8 +660,8 @@ def explained_variance(prediction, returns, alive):
 def ppo_loss(agent, batch, mb, clip_coef, vf_coef, ent_coef):
     """-L_CLIP + c1 L_VF - c2 H over the living steps of the episodes `mb`; returns it and what is logged.
 
-    The paper's sum with the sign that raises L_CLIP, and L_VF = 1/2 (V - R)^2. Under torchrun the loss is this
-    process's part of the mean (the gradients are then summed), what is logged is of all.
+    The paper's sum with the sign that raises L_CLIP, and L_VF = 1/2 (critic - target)^2. Under torchrun the loss is
+    this process's part of the mean (the gradients are then summed), what is logged is of all.
     """
     alive = batch.alive[:, mb]
     advantages = batch.advantages[:, mb]
@@ -649,7 +680,7 @@ def ppo_loss(agent, batch, mb, clip_coef, vf_coef, ent_coef):
     pg_loss = mean(torch.max(-advantages * ratio, -advantages * clipped))
 
     # value loss, L_VF
-    v_loss = mean(0.5 * (newvalue - batch.returns[:, mb]) ** 2)
+    v_loss = mean(0.5 * (newvalue - batch.targets[:, mb]) ** 2)
 
     entropy_loss = mean(entropy)
     loss = pg_loss - ent_coef * entropy_loss + vf_coef * v_loss
@@ -677,29 +708,34 @@ def at(schedule, progress):
     return float(np.interp(progress, places, values))
 
 
-def set_noise(agent, args, progress):
-    """Set the log-std where it is not learned; returns the learning rate of this update.
-
-    Two Gaussians of one std whose means differ by d have a KL divergence of d^2 / (2 std^2). The less noise, the
-    further an optimiser's step of fixed size moves the policy. With a rate in proportion to the std it moves it equally
-    far at any noise, so that the noise can fall by a factor of hundreds and the policy still learns.
-    """
+def set_log_std(agent, args, progress):
+    """Set the log-std of this update, where points of --log-std set it; keep a learned one where it has a gradient."""
     if agent.actor_logstd.requires_grad:
         agent.actor_logstd.data.clamp_(*LOG_STD_RANGE)  # beyond it get_policy's clamp leaves no gradient
     else:
         agent.actor_logstd.data.fill_(at(args.log_std, progress))
+
+
+def learning_rate_of(agent, args, progress):
+    """The learning rate of this update; with --lr-times-std in proportion to the policy's standard deviation.
+
+    Means that differ by delta have a KL divergence of delta^2 / (2 std^2), and a step of Adam moves the mean by about
+    the learning rate, whatever the std. With a rate in proportion to it a step has the same KL at any noise. So the
+    noise can fall by a factor of hundreds, and the policy still learns.
+    """
     learning_rate = at(args.learning_rate, progress)
-    if args.lr_times_std:
-        learning_rate *= agent.actor_logstd.exp().mean().item()
-    return learning_rate
+    if not args.lr_times_std:
+        return learning_rate
+    return learning_rate * agent.actor_logstd.exp().mean().item()
 
 
 def linear_fit(x, y, alive):
     """Ridge regression of y (..., G) on x (..., G, k) over the G episodes of a group that live: the fitted y.
 
-    Each episode is in its own fit. This shrinks its residual by the factor 1 - l, where l is its leverage. l depends
-    on the states at this step, not on the action: a state's gradient keeps its direction, and extreme states count
-    less. (A fit without it was worse: docs/training-notes.md.)
+    Each episode is in its own fit, which shrinks its residual by the factor 1 - l, its leverage l. With lambda = 1 this
+    keeps the direction of a state's expected gradient, because l depends on the states at this step and not on the
+    action; extreme states count less. With a smaller lambda that is approximate. (Fits that leave the episode out were
+    worse: docs/training-notes.md.)
     """
     x, y = x.double(), y.double()[..., None]
     weight = alive.double()[..., None]  # (..., G, 1)
@@ -714,11 +750,12 @@ def linear_fit(x, y, alive):
 
 
 def returns_baseline(batch, gamma, group):
-    """b (T, N) and c (T, 1) of the value V(s, t) = b + c critic(s, t); with group 1 the paper's, b = 0 and c = 1.
+    """b (T, N) and c (T, 1) of the value V(s_t) = b_t + c_t critic(s_t). The paper's: b = 0, c = 1; so with group 1.
 
     Each `group` of episodes that follow one another flew the same start. b regresses their returns from step t on
-    linearly on the states that they have reached by then, c is the spread of what is left. With small noise a critic's
-    error is larger than what an action changes; comparing flights of one start shows what an action changes.
+    linearly on the states that they have reached by then. c is the spread of what is left at step t, over all flights,
+    and 0.3 of its mean over the steps, added as squares: without it steps of hardly any spread would be blown up. With
+    small noise a critic's error is larger than what an action changes; comparing flights of one start shows it.
 
     Relatives: the mean return of other samples of the same question as the baseline (RLOO, Kool et al. 2019), or of the
     whole group, in units of its spread (GRPO, Shao et al. 2024). They have one return a sample, we one a step; hence
@@ -726,15 +763,15 @@ def returns_baseline(batch, gamma, group):
     """
     if group == 1:
         return torch.zeros_like(batch.rewards), torch.ones_like(batch.rewards[:, :1])
-    no_values = torch.zeros_like(batch.values)
-    returns, _ = gae(batch.rewards, no_values, batch.alive, gamma, 1.0)  # Monte-Carlo
+    no_values = torch.zeros_like(batch.critic)
+    monte_carlo, _ = gae(batch.rewards, no_values, batch.alive, gamma, 1.0)
     obs = batch.obs.unflatten(1, (-1, group))
-    grouped_returns = returns.unflatten(1, (-1, group))
+    grouped_returns = monte_carlo.unflatten(1, (-1, group))
     alive = batch.alive.unflatten(1, (-1, group))
     baseline = linear_fit(obs, grouped_returns, alive).flatten(1)
-    _, variance = moments(returns - baseline, batch.alive, 1)
-    floor = 0.3 * variance.sqrt().mean()  # for steps of next to no spread; steps after every end count as zeros
-    return baseline, (variance + floor**2 + 1e-8).sqrt()
+    _, variance = moments(monte_carlo - baseline, batch.alive, 1)
+    mean_spread = variance.sqrt().mean()  # steps that no flight reaches count as zeros
+    return baseline, (variance + (0.3 * mean_spread) ** 2 + 1e-8).sqrt()
 
 
 # Shared: training (Algorithm 1) and main ------------------------------------------------------------------------------
@@ -749,19 +786,21 @@ def train(args, agent, average, optimizer, envs, run):
         memory_noise = at(args.memory_noise, progress)
         gae_lambda = at(args.gae_lambda, progress)
         ent_coef = at(args.ent_coef, progress)
-        learning_rate = set_noise(agent, args, progress)
+        set_log_std(agent, args, progress)
+        learning_rate = learning_rate_of(agent, args, progress)
         optimizer.param_groups[0]["lr"] = learning_rate
-        group = set_curriculum(envs, args, progress)
+        group = set_curriculum(envs, args, progress)  # ours
 
         # lines 3-13: fly one episode in every environment
         batch, episodes = rollout(agent, envs, args.reward_scale, memory_noise)
-        shape_rewards(envs, args, progress, batch, episodes)
+        add_rewards(envs, args, progress, batch, episodes)  # ours
 
-        # line 14: advantages, and what the critic learns
-        baseline, scale = returns_baseline(batch, args.gamma, group)
-        values = baseline + scale * batch.values
+        # line 14: returns and advantages
+        baseline, scale = returns_baseline(batch, args.gamma, group)  # ours; 0 and 1 with group 1
+        values = baseline + scale * batch.critic
         advantages, returns = gae(batch.rewards, values, batch.alive, args.gamma, gae_lambda)
-        batch.advantages, batch.returns = advantages, (returns - baseline) / scale
+        batch.targets = (returns - baseline) / scale
+        batch.advantages = advantages
         if args.norm_adv:
             mean, variance = moments(advantages, batch.alive, (0, 1))
             batch.advantages = (advantages - mean) / (variance.sqrt() + 1e-8)
@@ -781,12 +820,12 @@ def train(args, agent, average, optimizer, envs, run):
                 gradient_norm = nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
                 runs.refuse_nan({**losses, "gradient norm": gradient_norm}, epoch, minibatch)
                 optimizer.step()
-                average.update_parameters(agent)
+                average.update_parameters(agent)  # ours: what evaluation flies
             if losses["approx_kl"] > target_kl:
                 break  # the minibatch that went too far has taken no step, and ends the update
 
         means = {name: torch.stack([logged[name] for logged in log]).mean().item() for name in losses}
-        means["explained_variance"] = explained_variance(batch.values, batch.returns, batch.alive)
+        means["explained_variance"] = explained_variance(batch.critic, batch.targets, batch.alive)
         means["baseline_explained_variance"] = explained_variance(baseline, returns, batch.alive)
 
         run.end_update(iteration, batch.alive, episodes, means, learning_rate)
@@ -799,7 +838,7 @@ def main(argv):
     envs = runs.make_envs(args, env_options)
     agent = Agent(args, envs).to(device)
     runs.load_checkpoint(agent, args, saved)
-    prepare(agent, args, env_options)
+    before_training(agent, args, env_options)
     average = AveragedModel(agent, multi_avg_fn=get_ema_multi_avg_fn(args.weight_average))
     optimizer = torch.optim.Adam(agent.parameters(), eps=1e-5, fused=True)  # train sets its learning rate
     run = runs.Run(

@@ -4,9 +4,10 @@
     python benchmarks/same_training.py results/di --updates 20
 
 results/commits.json says by which commit each seed was trained. The first of a result's commands, cut to `--updates`
-(curriculum and refinement are shares of a training, so they fall into it), is run by the code of each of these commits
+(schedules are over a training's updates, so all of them falls into it), is run by the code of each of these commits
 and by that of HEAD, each taken out of git into a temporary folder. Prints a line for each; exit status 1 if one bit of
-what was learned differs. What is flown is these weights' average, and no part of the training.
+what was learned differs. What is flown is these weights' average, and no part of the training. Table 1's long runs are
+not compared: the code that trained them has other flags.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ import run_seeds  # noqa: E402
 from common.command_line import OneLineParser, integer  # noqa: E402
 
 COMMITS = ROOT / "results" / "commits.json"
-LISTS = [ROOT / "benchmarks" / f"{name}_jobs.txt" for name in ("result", "table_1")]
+JOBS = ROOT / "benchmarks" / "result_jobs.txt"
 
 
 def checkout(commit, folder):
@@ -65,8 +66,7 @@ def differing(one, other):
 
 def first_jobs():
     """The first line of each results folder: folder -> command."""
-    jobs = [job for path in LISTS for job in run_seeds.read_jobs(path)]
-    return {str(job.results): job.command for job in reversed(jobs)}
+    return {str(job.results): job.command for job in reversed(run_seeds.read_jobs(JOBS))}
 
 
 def compare(name, command, commits, updates, temporary):
@@ -76,9 +76,9 @@ def compare(name, command, commits, updates, temporary):
         folder = temporary / commit
         if not folder.exists():
             checkout(commit, folder)
-        for flag, path in zip(command, command[1:]):
-            if flag == "--checkpoint" and commit != "HEAD":  # all begin with the same weights
-                shutil.copy(temporary / "HEAD" / path, folder / path)
+        if commit != "HEAD":  # what begins with a policy begins with the same one
+            for policy in (temporary / "HEAD" / "results").glob("*/agent.safetensors"):
+                shutil.copy(policy, folder / "results" / policy.parent.name)
         found[commit] = train(command, folder, updates)
     wrong = {commit: differing(found["HEAD"], found[commit]) for commit in commits}
     for commit, count in wrong.items():

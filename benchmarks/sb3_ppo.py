@@ -70,7 +70,7 @@ class OurFeatures(VecEnvWrapper):
 class OurCurriculum(BaseCallback):
     """Before each rollout, what our script changes by the share of training done, and the price of propellant.
 
-    Ours compares the masses of flights that have all ended (`shape_rewards`). This library's rollouts end in the midst
+    Ours compares the masses of flights that have all ended (`add_rewards`). This library's rollouts end in the midst
     of flights, so here propellant costs by the kilogram, as it did in our script before d1455f1: nothing in the first
     quarter, most at 60 %, a tenth of that at the end.
     """
@@ -140,7 +140,7 @@ class Evaluation(BaseCallback):
         self.env_id, self.env_options, self.samples = env_id, env_options, samples
         task = task_of(env_id)
         self.keys = task.progress_keys(**env_options)
-        self.starts = task.default_flights(trains=False, **env_options)
+        self.starts = task.default_flights(is_brief=False, **env_options)
         self.curve, self.metrics, self.seconds = [], {}, 0.0
 
     def _on_training_start(self):

@@ -1,12 +1,12 @@
-"""How far dispersed flights differ from their mean, and how much of what they miss could be told from that.
+"""How far dispersed flights differ from the nominal one, and how much of what they miss could be told from that.
 
     python benchmarks/seen.py results/rocket_dispersed/agent.safetensors
 
 Flies the mean action on 341 draws. Every 100 s, and 40 and 10 s before the first flight ends, it prints the standard
-deviation of each of the seven differences in the sizes of `DIFFERENCES`: a vehicle whose flights differ by far more or
+deviation of each of the eight differences in the sizes of `DIFFERENCES`: a vehicle whose flights differ by far more or
 less wants other sizes. Beside it stands the part of the variance of each element's final miss that is a linear function
 of the differences (R squared): as the policy sees them, up to ten sizes, and as it would through tanh, which is flat
-beyond two and was in their place until commit 946da1f.
+beyond two.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from rocket.metrics import draws, element_misses, fly_dispersed  # noqa: E402
 
 SCRIPT = importlib.import_module("ppo_gtrxl_rocket")
 FLIGHTS = 341
-NAMES = ("altitude", "climb", "out of plane", "its speed", "speed", "log mass", "angle")
+NAMES = ("h, three components", "e, three components", "log mass", "angle")
 
 
 def fly(agent, args, options, n):
@@ -70,7 +70,7 @@ def main():
     print("standard deviations of the differences, in their sizes:", ", ".join(NAMES))
     print("and R squared of the final misses, by the differences / by their tanh:", ", ".join(misses))
     for t in [*range(50, late[0], round(100 / dt)), *late]:
-        differences = SCRIPT.features(agent, obs[t])[:, -len(NAMES) :].numpy()
+        differences = SCRIPT.features(agent, obs[t])[:, -len(SCRIPT.DIFFERENCES) :].numpy()
         spread = " ".join(f"{size:5.2f}" for size in differences.std(axis=0))
         flat = np.tanh(differences)
         shares = (f"{explained(differences, y):5.2f} /{explained(flat, y):5.2f}" for y in misses.values())

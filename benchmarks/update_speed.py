@@ -216,7 +216,7 @@ def gathered_epoch(bench, batch, samples):
             torch.max(-advantages * ratio, -advantages * clipped).mean()
             - bench.script.at(args.ent_coef, 0.0) * entropy.mean()
         )
-        loss = loss + args.vf_coef * 0.5 * (newvalue - batch.returns[t, n]).square().mean()
+        loss = loss + args.vf_coef * 0.5 * (newvalue - batch.targets[t, n]).square().mean()
         bench.optimizer.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)

@@ -58,8 +58,8 @@ class Task(Protocol):
 
     # --- the size of an evaluation, and what a run may not do
 
-    def default_flights(self, trains: bool, **env_options) -> int:
-        """How many flights the reported evaluation has where --eval-starts is not given; `trains`: not --eval-only."""
+    def default_flights(self, is_brief: bool, **env_options) -> int:
+        """How many flights the reported evaluation has where --eval-starts is not given; fewer if `is_brief`."""
         ...
 
     def interim_flights(self, n: int, **env_options) -> int:

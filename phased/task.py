@@ -58,8 +58,8 @@ class PhasedTask:
 
     # --- the size of an evaluation, and what a run may not do
 
-    def default_flights(self, trains: bool, **env_options) -> int:
-        return 50 if trains else 1000
+    def default_flights(self, is_brief: bool, **env_options) -> int:
+        return 50 if is_brief else 1000
 
     def interim_flights(self, n: int, **env_options) -> int:
         return n

@@ -7,10 +7,9 @@ import numpy as np
 from rocket.orbits import target_axes, target_orbit
 from rocket.vehicle import Rocket
 
-# sizes by which flights at dispersion 1 differ on their way (at the cut-off by up to four times that): altitude
-# 3 km, climb rate 15 m/s, position and speed out of the plane 0.5 km and 1.5 m/s, speed 30 m/s, the logarithm of the
-# observed mass, angle flown 6 km of arc
-DIFFERENCES = [0.03, 0.015, 0.005, 0.0015, 0.004, 0.003, 0.001]
+# sizes by which flights at dispersion 1 differ at the same energy of the same burn: the three components of
+# (h - h_T) / |h_T| and those of e - e_T, the logarithm of the observed mass, the angle flown in rad
+DIFFERENCES = [5e-5, 5e-5, 5e-5, 1e-4, 3e-4, 2e-5, 0.01, 0.004]
 
 
 def policy_constants(rocket: Rocket) -> dict:
@@ -18,8 +17,8 @@ def policy_constants(rocket: Rocket) -> dict:
 
     `axes` (3, 3), rows towards the perigee, along the semi-latus rectum and normal to the plane; `units` (7,) of r, v
     and m (the Earth's radius, circular speed there, the dry mass); angular momentum `h_target` and eccentricity vector
-    `e_target` (3,); `phases`, what is observed of each burn; `nominal_flight` (steps + 1, 9), rows of burn, specific
-    energy and seven quantities, which a dispersed training fills, and the `differences` (7,) by which flights differ.
+    `e_target` (3,); `phases`, what is observed of each burn; `nominal_flight` (steps + 1, 10), rows of burn, specific
+    energy and what flights are compared by, which a dispersed training fills; `differences` (8,), the sizes of those.
     """
     axes = target_axes(rocket)
     steps = int(np.ceil(rocket.end_time / rocket.dt))

@@ -97,10 +97,10 @@ class RocketTask:
 
     # --- the size of an evaluation, and what a run may not do
 
-    def default_flights(self, trains: bool, dispersion: float = 0.0, **env_options) -> int:
+    def default_flights(self, is_brief: bool, dispersion: float = 0.0, **env_options) -> int:
         if dispersion:
-            return DISPERSED_STARTS
-        return 50 if trains else 1000  # noted alone: there is one start
+            return INTERIM_STARTS if is_brief else DISPERSED_STARTS
+        return 50 if is_brief else 1000  # noted alone: there is one start
 
     def interim_flights(self, n: int, dispersion: float = 0.0, **env_options) -> int:
         return min(n, INTERIM_STARTS) if dispersion else n

@@ -75,7 +75,7 @@ def test_rollout_stores_what_training_recomputes(dtype, uneven_envs):
     np.testing.assert_array_equal(batch.alive.numpy(), alive)
     hidden = agent.encode(batch.obs.transpose(0, 1), batch.memory).transpose(0, 1)
     logprobs, _, values = agent.evaluate_actions(hidden, batch.actions)
-    for rolled, trained in ((batch.logprobs, logprobs), (batch.values, values)):
+    for rolled, trained in ((batch.logprobs, logprobs), (batch.critic, values)):
         torch.testing.assert_close(rolled[batch.alive > 0], trained[batch.alive > 0], rtol=0, atol=TOLERANCE[dtype])
     living = alive[:23]
     np.testing.assert_allclose(array(batch.obs)[:23][living], np.array(envs.given_obs)[:23][living], atol=1e-7)

@@ -1,4 +1,4 @@
-"""Dispersed flights beside the nominal one: what `prepare` keeps of it, how it is looked up, what is seen."""
+"""Dispersed flights beside the nominal one: what `before_training` keeps of it, how it is looked up, what is seen."""
 
 import gymnasium as gym
 import numpy as np
@@ -6,23 +6,24 @@ import pytest
 import torch
 
 import ppo_gtrxl_rocket as script
-from envs import ROCKETS, local_frame, target_axes
+from envs import ROCKETS, target_axes, target_orbit
 
 CUTOFF = "RocketAscentCutoff-v0"
 SMALL = {"embed_dim": 8, "num_heads": 2, "mlp_dim": 8, "hidden_dim": 8, "num_blocks": 1, "memory_length": 4}
-SCALES = [0.03, 0.015, 0.005, 0.0015, 0.004, 0.003, 0.001]
+SCALES = [5e-5, 5e-5, 5e-5, 1e-4, 3e-4, 2e-5, 0.01, 0.004]
 torch.set_num_threads(1)
 
 
 def compared(y, rocket):
-    """What flights are compared by, of one state, in the plain units of the text: 100 km, km/s, 7.9 km/s, rad."""
+    """What flights are compared by, of one state, by textbook formulas in SI and unit vectors."""
     r, v = y[:3], y[3:6]
-    perigee, semi_latus, normal = target_axes(rocket)
-    radius, circular = np.linalg.norm(r), np.sqrt(rocket.mu / rocket.Re)
-    altitude, climb = 64 * (radius / rocket.Re - 1), 8 * (r @ v) / radius / circular
-    out = 64 * (r @ normal) / rocket.Re, 8 * (v @ normal) / circular
-    angle = np.arctan2(r @ semi_latus, r @ perigee)
-    return [altitude, climb, *out, np.linalg.norm(v) / circular, np.log(y[6] / rocket.dry_mass), angle]
+    axes = np.array(target_axes(rocket))
+    h_target, e_target = target_orbit(rocket.target, rocket.mu)
+    h = np.cross(r, v)
+    e = np.cross(v, h) / rocket.mu - r / np.linalg.norm(r)
+    angle = np.arctan2(r @ axes[1], r @ axes[0])
+    mass = np.log(y[6] / rocket.dry_mass)
+    return [*axes @ (h - h_target) / np.linalg.norm(h_target), *axes @ (e - e_target), mass, angle]
 
 
 def make_agent(dispersion=1.0, env_id=CUTOFF, **options):
@@ -70,7 +71,7 @@ def test_the_nominal_flight_is_kept_as_it_was_flown(flown):
     agent, seen = flown
     rocket = ROCKETS[CUTOFF].rocket
     table = agent.nominal_flight.numpy()
-    assert table.shape == (482, 9) and len(seen) == 482
+    assert table.shape == (482, 10) and len(seen) == 482
     np.testing.assert_array_equal(table[:, 0], np.round(3 * seen[:, 8]))
     assert set(table[:, 0]) == {0, 1, 2, 3}
     expected = [[energy(y, rocket), *compared(y, rocket)] for y in seen]
@@ -89,7 +90,7 @@ def test_a_flight_that_ends_early_leaves_rows_of_no_burn():
 
 def test_the_nominal_flight_differs_in_nothing_from_itself(flown):
     agent, seen = flown
-    differs = script.features(agent, torch.as_tensor(seen))[:, -7:]
+    differs = script.features(agent, torch.as_tensor(seen))[:, -8:]
     assert differs.abs().max() < 0.02
 
 
@@ -109,41 +110,40 @@ def test_dispersed_flights_are_seen_beside_it_at_equal_energy(flown):
     rocket, table = ROCKETS[CUTOFF].rocket, agent.nominal_flight.numpy().astype(float)
     seen, ended = fly(climb, 8, dispersion=1.0)
     features = script.features(agent, torch.as_tensor(seen)).numpy()
-    assert features.shape[2] == 36
+    assert features.shape[2] == 37
     checked = 0
     for k in range(8):
         for t in range(20, ended[k], 7):
             expected = by_hand(seen[t, k], round(3 * seen[t, k, 8]), table, rocket)
-            np.testing.assert_allclose(features[t, k, -7:], expected, atol=0.05)
+            np.testing.assert_allclose(features[t, k, -8:], expected, atol=0.05)
             checked += np.abs(expected).max() > 0.5
     assert checked > 100  # they are told apart
     later = seen[100, :1].copy()
     later[:, 7] -= 0.2
-    at_once = [script.features(agent, torch.as_tensor(obs))[0, -7:] for obs in (seen[100, :1], later)]
+    at_once = [script.features(agent, torch.as_tensor(obs))[0, -8:] for obs in (seen[100, :1], later)]
     assert torch.equal(*at_once)
 
 
-def test_a_flight_three_kilometres_higher_reads_one(flown):
-    """The sizes are what their comment says they are: at equal energy it is slower, which reads as well."""
+def test_what_differs_by_its_size_reads_one(flown):
+    """An orbit turned in its plane by 0.004 rad, at the same energy and phase."""
     agent, seen = flown
     rocket = ROCKETS[CUTOFF].rocket
-    y = seen[30].copy()
-    up, _, _ = local_frame(y[:7, None], target_axes(rocket)[2])
-    radius = np.linalg.norm(y[:3])
-    y[:3] += 3000 * 6378145 / 6.4e6 * up[:, 0]  # 64: the unit of length is 99.66 km
-    slower = y[3:6] @ y[3:6] - 2 * rocket.mu * (1 / radius - 1 / np.linalg.norm(y[:3]))
-    y[3:6] *= np.sqrt(slower / (y[3:6] @ y[3:6]))
-    differs = script.features(agent, torch.as_tensor(y)[None])[0, -7:]
-    assert differs[0] == pytest.approx(1.0, abs=0.03)
-    circular = np.sqrt(rocket.mu / rocket.Re)
-    expected = (np.sqrt(slower) - np.linalg.norm(seen[30, 3:6])) / circular / 0.004
-    assert differs[4] == pytest.approx(expected, abs=0.03)
+    axes = np.array(target_axes(rocket))
+    cos, sin = np.cos(0.004), np.sin(0.004)
+    turn = axes.T @ [[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]] @ axes
+    y = seen[300].copy()
+    y[:3], y[3:6] = turn @ y[:3], turn @ y[3:6]
+    differs = script.features(agent, torch.as_tensor(y)[None])[0, -8:]
+    assert differs[7] == pytest.approx(1.0, abs=0.02)  # the angle
+    assert differs[6] == pytest.approx(0.0, abs=0.02)  # the mass
+    e = np.array(compared(y, rocket))[3:5] - np.array(compared(seen[300], rocket))[3:5]
+    np.testing.assert_allclose(differs[3:5], np.clip(e / [1e-4, 3e-4], -10, 10), atol=0.05)
 
 
 def test_before_a_dispersed_training_nothing_is_seen():
     agent, _, _ = make_agent()
     seen, _ = fly(climb, 2, dispersion=1.0)
-    assert not script.features(agent, torch.as_tensor(seen))[..., -7:].any()
+    assert not script.features(agent, torch.as_tensor(seen))[..., -8:].any()
 
 
 @pytest.mark.parametrize("observe_draw", [False, True])
@@ -155,14 +155,14 @@ def test_what_comes_into_sight_changes_nothing_at_first(observe_draw):
     blind = obs.clone()
     blind[..., 9:] = 0.0  # as nominal flights show it
     before = agent.encode(blind, memory)
-    script.prepare(agent, args, env_options)
+    script.before_training(agent, args, env_options)
     torch.testing.assert_close(agent.encode(obs, memory), before, rtol=0, atol=0)
     assert agent.nominal_flight.any()
     with torch.no_grad():
-        agent.encoder[0].weight[:, -7:] = 0.5
+        agent.encoder[0].weight[:, -8:] = 0.5
     kept = agent.nominal_flight.clone()
-    script.prepare(agent, args, env_options)  # a policy that has its nominal flight keeps it
-    assert (agent.encoder[0].weight[:, -7:] == 0.5).all() and torch.equal(agent.nominal_flight, kept)
+    script.before_training(agent, args, env_options)  # a policy that has its nominal flight keeps it
+    assert (agent.encoder[0].weight[:, -8:] == 0.5).all() and torch.equal(agent.nominal_flight, kept)
 
 
 @pytest.mark.parametrize(
@@ -172,7 +172,7 @@ def test_nothing_is_flown_where_no_dispersed_training_begins(changes):
     agent, args, env_options = make_agent()
     vars(args).update(changes)
     before = {name: tensor.clone() for name, tensor in agent.state_dict().items()}
-    script.prepare(agent, args, env_options)
+    script.before_training(agent, args, env_options)
     for name, tensor in agent.state_dict().items():
         assert torch.equal(tensor, before[name]), name
 
@@ -180,10 +180,10 @@ def test_nothing_is_flown_where_no_dispersed_training_begins(changes):
 def test_the_policy_itself_flies_it():
     """By its mean action, nominal vehicle and all."""
     agent, args, env_options = make_agent()
-    script.prepare(agent, args, env_options)
+    script.before_training(agent, args, env_options)
     agent.nominal_flight.zero_()
     script.fly_nominal(agent, agent.make_policy(481), gym.make_vec(CUTOFF, num_envs=1, action_frame="local"))
     kept = agent.nominal_flight.clone()
     again, _, _ = make_agent()
-    script.prepare(again, args, env_options)
+    script.before_training(again, args, env_options)
     torch.testing.assert_close(again.nominal_flight, kept, rtol=1e-5, atol=1e-5)

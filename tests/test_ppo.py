@@ -240,7 +240,8 @@ def test_learned_noise_stays_where_it_can_be_learned(learner):
     run = learner(log_std=0.5, ent_coef=1.0)
     assert min(log_stds(run, 3)) > 0.5
     run.collect()
-    assert script.set_noise(run.agent, run.args, 0.5) and run.agent.actor_logstd.item() == 0.5
+    script.set_log_std(run.agent, run.args, 0.5)
+    assert run.agent.actor_logstd.item() == 0.5
 
 
 def test_noise_reaches_minus_eight(learner):
@@ -297,7 +298,7 @@ def test_groups_are_compared_within_themselves(learner, group):
     """Episodes of different lengths: baseline, spread, the critic's targets and V in the advantages, by hand."""
     lengths = (6, 2, 5, 1, 6, 3, 4, 6, 5, 5, 1, 2)
     run = learner(lengths, flights_per_start=group, gamma=0.9, gae_lambda=0.8, norm_adv=False)
-    critic, obs, rewards = (getattr(run.batch, name).numpy().copy() for name in ("values", "obs", "rewards"))
+    critic, obs, rewards = (getattr(run.batch, name).numpy().copy() for name in ("critic", "obs", "rewards"))
     returns = monte_carlo(rewards, lengths, 0.9)
     alive, fit = np.isfinite(returns), direct_fit(obs, returns, group)
     spread = np.nanstd(returns - fit, axis=1, keepdims=True)  # of all groups' episodes
@@ -306,7 +307,7 @@ def test_groups_are_compared_within_themselves(learner, group):
     targets = (advantages + std * critic) / std  # the normalised A + V
     losses = run.update()
     np.testing.assert_allclose(run.batch.advantages.numpy()[alive], advantages[alive], rtol=1e-7, atol=1e-9)
-    np.testing.assert_allclose(run.batch.returns.numpy()[alive], targets[alive], rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(run.batch.targets.numpy()[alive], targets[alive], rtol=1e-7, atol=1e-9)
     whole, left = (advantages + fit + std * critic)[alive], (advantages + std * critic)[alive]
     assert losses["baseline_explained_variance"] == pytest.approx(1 - left.var() / whole.var())
     assert losses["explained_variance"] == pytest.approx(1 - (targets - critic)[alive].var() / targets[alive].var())
@@ -323,7 +324,7 @@ def test_one_flight_a_start_is_the_papers(learner):
 def test_explained_variance_is_the_critics_alone(learner):
     """Rewards follow the clock and nothing that is seen: a critic of 0 explains nothing, the baseline nearly all."""
     run = learner([6] * 40, flights_per_start=40)
-    run.batch.values.zero_()
+    run.batch.critic.zero_()
     run.batch.rewards[:] = torch.arange(6.0)[:, None] + 0.1 * torch.randn(6, 40)
     losses = run.update()
     assert abs(losses["explained_variance"]) < 0.01 < 0.95 < losses["baseline_explained_variance"] <= 1
@@ -333,7 +334,7 @@ def test_explained_variance_of_a_critic_that_knows(learner):
     run = learner([6] * 8, flights_per_start=4, gamma=1.0, gae_lambda=1.0)
     baseline, scale = script.returns_baseline(run.batch, 1.0, 4)
     returns, _ = script.gae(run.batch.rewards, torch.zeros(6, 8), run.batch.alive, 1.0, 1.0)
-    run.batch.values = (returns - baseline) / scale
+    run.batch.critic = (returns - baseline) / scale
     assert run.update()["explained_variance"] == pytest.approx(1.0)
 
 
@@ -377,7 +378,7 @@ def test_residual_is_a_part_of_the_leave_one_out_one():
 def test_steps_that_no_episode_reached(uneven_envs, group):
     run = Learner(uneven_envs([3, 2, 1, 1], spare_steps=2), flights_per_start=group)
     losses = run.update()
-    assert np.isfinite(list(losses.values())).all() and run.batch.returns.isfinite().all()
+    assert np.isfinite(list(losses.values())).all() and run.batch.targets.isfinite().all()
 
 
 @pytest.mark.parametrize("env_id", script.ENV_IDS)
@@ -466,11 +467,11 @@ def test_dead_steps_do_not_touch_the_gradient(learner):
     for garbage, unlikely in ((0.0, 0.0), (3.0, 0.0), (0.0, 1e9)):
         run = learner([6, 2, 5])
         dead = run.batch.alive == 0
-        for name in ("obs", "actions", "logprobs", "rewards", "values"):
+        for name in ("obs", "actions", "logprobs", "rewards", "critic"):
             getattr(run.batch, name)[dead] += garbage
         run.batch.logprobs[dead] -= unlikely
-        gae = script.gae(run.batch.rewards, run.batch.values, run.batch.alive, 0.99, 0.95)
-        run.batch.advantages, run.batch.returns = gae
+        gae = script.gae(run.batch.rewards, run.batch.critic, run.batch.alive, 0.99, 0.95)
+        run.batch.advantages, run.batch.targets = gae
         loss, _ = script.ppo_loss(run.agent, run.batch, torch.arange(3), 0.2, 0.2, 1e-3)
         loss.backward()
         gradients.append([loss.detach(), *(p.grad for p in run.agent.parameters() if p.grad is not None)])
@@ -494,11 +495,11 @@ def test_minibatches_cover_each_episode_once_an_epoch(learner, asked):
 @pytest.mark.parametrize("norm_adv", [True, False])
 def test_advantages_are_normalised_over_living_steps(learner, norm_adv):
     run = learner(norm_adv=norm_adv)
-    rewards, values = run.batch.rewards.numpy(), run.batch.values.numpy()
+    rewards, values = run.batch.rewards.numpy(), run.batch.critic.numpy()
     expected = direct_gae(rewards, values, run.envs.lengths, 0.99, 0.95)
     alive = np.arange(6)[:, None] < run.envs.lengths
     run.update()
-    np.testing.assert_allclose(run.batch.returns.numpy()[alive], (expected + values)[alive], atol=1e-9)
+    np.testing.assert_allclose(run.batch.targets.numpy()[alive], (expected + values)[alive], atol=1e-9)
     living = expected[alive]
     living = (living - living.mean()) / living.std() if norm_adv else living
     np.testing.assert_allclose(run.batch.advantages.numpy()[alive], living, rtol=1e-6, atol=1e-9)
@@ -509,12 +510,12 @@ def test_update_returns_means_over_all_minibatches(learner, monkeypatch):
     logged, loss = [], script.ppo_loss
     monkeypatch.setattr(script, "ppo_loss", lambda *inputs: [result := loss(*inputs), logged.append(result[1])][0])
     run = learner()
-    alive, values = run.batch.alive.numpy() > 0, run.batch.values.numpy()
+    alive, values = run.batch.alive.numpy() > 0, run.batch.critic.numpy()
     returned = run.update()
     assert len(logged) == 6
     for name in ("policy_loss", "value_loss", "entropy", "total_loss", "approx_kl", "old_approx_kl", "clipfrac"):
         assert returned[name] == pytest.approx(np.mean([losses[name].item() for losses in logged])), name
-    returns = run.batch.returns.numpy()[alive]
+    returns = run.batch.targets.numpy()[alive]
     expected = 1 - np.var(returns - values[alive]) / np.var(returns)
     assert returned["explained_variance"] == pytest.approx(expected)
 

@@ -72,7 +72,7 @@ def learn(rank, world, folder, settings):
     losses = update(script, args, (agent, average, optimizer), envs, batch)
     assert world == 1 or 1 <= max(exchanges[:-1]) <= 3, exchanges  # the last is counted with what is logged
     saved = {"gradients": gradients, "weights": agent.state_dict(), "losses": losses, "advantages": batch.advantages}
-    torch.save({**saved, "alive": batch.alive, "returns": batch.returns}, f"{folder}/{world}_{rank}.pt")
+    torch.save({**saved, "alive": batch.alive, "targets": batch.targets}, f"{folder}/{world}_{rank}.pt")
 
 
 @pytest.mark.parametrize(
@@ -100,7 +100,7 @@ def test_two_processes_learn_what_one_does(tmp_path, settings):
     for other in (first, second):
         torch.testing.assert_close(other["weights"], one["weights"], rtol=0, atol=1e-5)
         assert other["losses"] == pytest.approx(one["losses"], rel=1e-4, abs=1e-6)
-    for name in ("advantages", "returns"):
+    for name in ("advantages", "targets"):
         both = torch.cat([first[name], second[name]], dim=1)
         torch.testing.assert_close(both[one["alive"] > 0], one[name][one["alive"] > 0], rtol=1e-5, atol=1e-6)
 

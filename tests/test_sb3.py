@@ -174,8 +174,8 @@ def test_the_benchmark_keeps_the_nominal_flight(recurrent):
             super()._on_training_start()
             np.testing.assert_allclose(flown(obs, 0), before, atol=1e-6)
             next_obs, _, _, _ = nominal.advance(before)
-            _, _, _, compared = script.motion(seen.constants, torch.as_tensor(next_obs, dtype=torch.float32))
-            kept.append((seen.constants.nominal_flight.clone(), compared[0]))
+            m = script.motion(seen.constants, torch.as_tensor(next_obs, dtype=torch.float32))
+            kept.append((seen.constants.nominal_flight.clone(), script.compared(m)[0]))
 
     for _ in range(2):
         model.learn(60, callback=Watch(script, env_id, options, seen))
@@ -183,7 +183,7 @@ def test_the_benchmark_keeps_the_nominal_flight(recurrent):
     torch.testing.assert_close(flight[1, 2:], second_row)
     assert flight[:, 2:].any(dim=1).sum() > 50 and torch.equal(flight, again)
     assert vars(model.get_vec_normalize_env())["nominal_flight"] is seen.constants.nominal_flight
-    differs = model.get_vec_normalize_env().normalize_obs(seen(seen.raw))[:, -7:]
+    differs = model.get_vec_normalize_env().normalize_obs(seen(seen.raw))[:, -8:]
     assert 0.01 < np.abs(differs).max() <= 10
 
 

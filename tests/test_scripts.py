@@ -182,8 +182,9 @@ def test_an_id_without_a_recipe_takes_its_familys(monkeypatch, capsys):
     for like in ("RocketAscentCutoff-v0", "RocketAscent-v0"):
         monkeypatch.setitem(envs.ROCKETS, "Mine-v0", envs.ROCKETS[like])
         assert ROCKET.recipe(ROCKET.Args(env_id="Mine-v0")) == ROCKET.RECIPES[like]
-        assert ROCKET.recipe(ROCKET.Args(env_id="Mine-v0", dispersion=1.0)) == ROCKET.RECIPES[like]
-        assert "train one without dispersion" in capsys.readouterr().out
+        anew = ROCKET.recipe(ROCKET.Args(env_id="Mine-v0", dispersion=1.0))
+        assert anew == ROCKET.RECIPES[like] | {"num_envs": 64, "flights_per_start": 16}
+        assert "no policy of Mine-v0 to begin with, so this training begins anew" in capsys.readouterr().out
     mine = ROCKET.recipe(ROCKET.Args(env_id="Mine-v0", dispersion=1.0, checkpoint="mine.safetensors"))
     assert mine["checkpoint"] == "mine.safetensors" and mine["log_std"] == ROCKET.DISPERSED["log_std"]
 
@@ -630,7 +631,7 @@ def test_phases_are_one_hot_whatever_their_number(number):
     assert len(phases) == number
     obs = torch.tensor([[6.4e6, 0.0, 0.0, 0.0, 7e3, 0.0, 1e4, 0.5, phase] for phase in phases], dtype=torch.float32)
     seen = ROCKET.features(agent, obs)
-    assert seen.shape[1] == 13 + 2 * 6 + number + 7  # state, error, its tanh, and what differs from the mean flight
+    assert seen.shape[1] == 13 + 2 * 6 + number + 8  # state, error, its tanh, and what differs from the nominal flight
     if number > 1:
         (columns,) = np.nonzero((seen != seen[0]).any(0).numpy())
         assert len(columns) == number and torch.equal(seen[:, columns], torch.eye(number))

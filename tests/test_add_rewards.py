@@ -26,7 +26,7 @@ def flights(seed=0, size=1e-3):
 
 
 def paid(episodes, progress=0.4, env_id=ENV_ID, flying=N, **flags):
-    """The rewards (T, flying) that `shape_rewards` adds; flight k lives k + 1 steps."""
+    """The rewards (T, flying) that `add_rewards` adds; flight k lives k + 1 steps."""
     args = script.Args(**{**script.RECIPES[ENV_ID], "env_id": env_id, "num_envs": flying, **flags})
     envs = gym.make_vec(env_id, num_envs=flying, dispersion=args.dispersion).unwrapped
     envs.flights_per_start = args.flights_per_start
@@ -34,7 +34,7 @@ def paid(episodes, progress=0.4, env_id=ENV_ID, flying=N, **flags):
     alive = (torch.arange(flying)[:, None] <= torch.arange(flying)).float()
     rewards = torch.zeros(flying, flying)
     batch = script.Batch(*[torch.zeros(0)] * 3, rewards, torch.zeros(0), alive, torch.zeros(0))
-    script.shape_rewards(envs, args, progress, batch, episodes)
+    script.add_rewards(envs, args, progress, batch, episodes)
     return batch.rewards.numpy()
 
 
