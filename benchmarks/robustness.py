@@ -22,7 +22,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from unittest import mock
 
@@ -223,7 +223,7 @@ def hostile_state(rng, state):
 
 def parse_at_once(script, **flags):
     """`parse_args` of these flags without tyro, which takes ten times as long as the rest."""
-    with mock.patch.object(runs, "read_flags", lambda kind, argv: (kind(**flags), set(flags))):
+    with mock.patch.object(runs, "read_flags", lambda defaults, argv: (replace(defaults, **flags), set(flags))):
         return parse_args(script, [])
 
 
@@ -242,7 +242,7 @@ def load_state(script, folder):
     agent = script.Agent(args, batch)
     runs.load_checkpoint(agent, args, saved)
     average = script.AveragedModel(agent, multi_avg_fn=script.get_ema_multi_avg_fn(args.weight_average))
-    optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
+    optimizer = torch.optim.Adam(agent.parameters(), eps=1e-5, fused=True)
     runs.restore(saved, Path(folder), {"agent": agent, "average": average, "optimizer": optimizer}, batch)
 
 

@@ -5,8 +5,7 @@
 Flies the mean action on 341 draws. Every 100 s, and 40 and 10 s before the first flight ends, it prints the standard
 deviation of each of the eight differences in the sizes of `DIFFERENCES`: a vehicle whose flights differ by far more or
 less wants other sizes. Beside it stands the part of the variance of each element's final miss that is a linear function
-of the differences (R squared): as the policy sees them, up to ten sizes, and as it would through tanh, which is flat
-beyond two.
+of the differences (R squared).
 """
 
 from __future__ import annotations
@@ -68,12 +67,11 @@ def main():
     dt, last = gym.make(args.env_id).unwrapped.batch.dt, int(flown.min())
     late = [last - round(seconds / dt) for seconds in (40, 10)]
     print("standard deviations of the differences, in their sizes:", ", ".join(NAMES))
-    print("and R squared of the final misses, by the differences / by their tanh:", ", ".join(misses))
+    print("and R squared of the final misses by the differences:", ", ".join(misses))
     for t in [*range(50, late[0], round(100 / dt)), *late]:
         differences = SCRIPT.features(agent, obs[t])[:, -len(SCRIPT.DIFFERENCES) :].numpy()
         spread = " ".join(f"{size:5.2f}" for size in differences.std(axis=0))
-        flat = np.tanh(differences)
-        shares = (f"{explained(differences, y):5.2f} /{explained(flat, y):5.2f}" for y in misses.values())
+        shares = (f"{explained(differences, y):5.2f}" for y in misses.values())
         print(f"{dt * t:5.0f} s   {spread}   " + "   ".join(shares))
 
 

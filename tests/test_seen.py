@@ -26,11 +26,10 @@ def run(monkeypatch, path, flights=seen.FLIGHTS):
 
 
 def test_the_shipped_policy(monkeypatch, capsys):
-    """Early the angle differs by less than its size, at the end by several; the perigee is then seen, less by tanh."""
+    """No difference is far from its size; ten seconds before the end they tell the misses that are left."""
     run(monkeypatch, RESULTS / "rocket_dispersed/agent.safetensors", flights=40)
     _, _, *lines = capsys.readouterr().out.splitlines()
     rows = np.array([re.findall(r"[\d.]+", line) for line in lines], dtype=float)
-    assert rows.shape == (10, 1 + 7 + 2 * 4) and rows[0, 0] == 100 and (np.diff(rows[:, 0]) > 0).all()
-    assert rows[0, 7] < 1 and 3 < rows[-1, 7] < 6
-    by_differences, by_tanh = rows[:, 8::2], rows[:, 9::2]
-    assert (by_differences <= 1).all() and by_differences[-1, 0] > 0.99 > by_tanh[-1, 0]
+    assert rows.shape == (10, 1 + 8 + 4) and rows[0, 0] == 100 and (np.diff(rows[:, 0]) > 0).all()
+    assert rows[:, 1:9].max() < 10
+    assert (rows[:, 9:] <= 1).all() and rows[-1, 9:].min() > 0.8
