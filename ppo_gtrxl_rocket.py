@@ -1,4 +1,4 @@
-"""PPO with a Gated Transformer-XL on a four-phase rocket ascent, measured against the true optimum in the same run.
+"""PPO with a Gated Transformer-XL on a rocket's ascent to orbit, measured against the true optimum in the same run.
 
     python ppo_gtrxl_rocket.py --seed 1                                 # the paper's 961 s, as results/rocket_fixed
     python ppo_gtrxl_rocket.py --seed 1 --env-id RocketAscentCutoff-v0  # free final time
@@ -7,8 +7,12 @@
     python ppo_gtrxl_rocket.py --eval-only --checkpoint results/rocket_fixed/agent.safetensors
 
 Top to bottom: arguments, recipes, problem, Gated Transformer-XL, agent, PPO, what we add to it, training, main.
-From the first "Shared" on, all ppo_gtrxl_*.py are the same to the letter. "Ours" is what the paper does not have.
-T steps, N environments (Algorithm 1: E), L memory length, d width, H heads, dk = d / H.
+From the first "Shared" on, all ppo_gtrxl_*.py are the same to the letter. A section with "ours" in its heading has
+nothing from the paper; elsewhere a comment says so. T steps, N environments (Algorithm 1 calls these E, and its
+iterations N), L memory length, d width, H heads, dk = d / H.
+
+The reward is R_orbital + R_trajectory + R_guidance + R_penalties + R_terminal. The paper names the five without
+formulas; ours are in rocket/rewards.py. Here R_trajectory has no weight, and R_guidance only with --guidance.
 """
 
 from __future__ import annotations
@@ -33,16 +37,18 @@ from rocket.rewards import TERMINAL_SCALE, mass_rewards
 from runs import Schedule, all_reduce_sum
 
 
-# A schedule is a number, or "place:value place:value": place 0 is the first update, 1 the last; linear between the
-# points, constant before the first and after the last. Two points at one place are a jump.
 @dataclass
 class Args:
-    """The arguments; by default Table 1's column of this problem. RECIPES has what we change."""
+    """The flags. The values written here are Table 1's column of this problem: --recipe paper uses them as they are.
+
+    --recipe ours, the default, first replaces those in RECIPES. A flag that is typed wins over both. A Schedule is one
+    number, or points "place:value place:value ...": place 0 is the first update, 1 the last (`value_at` reads it).
+    """
 
     # experiment
     exp_name: str = Path(__file__).stem  # the name of this experiment
     seed: int = 1  # seed of the experiment
-    recipe: str = "ours"  # what no flag sets: ours (RECIPES) or paper (plain PPO with Table 1, as the defaults below)
+    recipe: str = "ours"  # the flags that are not typed: "ours" (RECIPES, then these) or "paper" (these)
     torch_deterministic: bool = True  # if toggled, `torch.backends.cudnn.deterministic=True`
     cuda: bool = True  # if toggled, a GPU is used when there is one
     num_threads: int = 1  # CPU threads of torch (0: torch's own choice); bits depend on it
@@ -55,7 +61,7 @@ class Args:
     checkpoint: str | None = None  # start from these weights (.safetensors)
     resume: str | None = None  # run folder of an interrupted run to go on with, bit for bit
     eval_only: bool = False  # fly the mean action of --checkpoint, train nothing, write only --eval-json and --eval-npz
-    eval_starts: int | None = None  # drawn flights of the evaluation (default: 1705; of a training cut short: 100)
+    eval_starts: int | None = None  # with --dispersion: drawn flights (default 1705; 100 in a training cut short)
     eval_seed: int = 0  # seed of the evaluation starts
     eval_json: str | None = None  # where --eval-only writes the metrics
     eval_npz: str | None = None  # where --eval-only writes the trajectories
@@ -64,8 +70,8 @@ class Args:
     # environment
     env_id: str = "RocketAscent-v0"  # the id of the environment, one of ENV_IDS
     observe_phase: bool = True  # show time and phase to the policy
-    dispersion: float = 0.0  # size of the draws of vehicle and air: 0 none, 1 the table `envs.Dispersion`
-    observe_draw: bool = False  # show the draw to the policy: an oracle
+    dispersion: float = 0.0  # spread of the vehicles: 0 all are nominal; 1 each flight draws one by `envs.Dispersion`
+    observe_draw: bool = False  # show the drawn vehicle to the policy, which no real flight could know
     observe_mass: bool = False  # show the true mass of a dispersed rocket, not the flight computer's
 
     # Table 1
@@ -90,19 +96,19 @@ class Args:
     norm_adv: bool = True  # normalise the advantages over an update
     max_grad_norm: float = 0.5  # the maximum norm for the gradient clipping
     target_kl: float | None = None  # the KL divergence from which an update takes no further step (none: no limit)
-    log_std: Schedule = -1.4  # log of the std in the action's unit. A number: learned from there; points: set
+    log_std: Schedule = -1.4  # log of the std in the action's unit. A number: learned from there; points: not learned
     memory_noise: Schedule = 0.1  # std of the memory before an episode (Algorithm 1, line 5; the text says "small")
-    reward_scale: float = 0.2  # factor on the rewards in training; everything logged is unscaled
+    reward_scale: float = 0.2  # factor on the rewards in training; losses are logged with it, returns without
 
     # ours: off here, on in RECIPES
     lr_times_std: bool = False  # the learning rate is --learning-rate times the policy's std
     flights_per_start: Schedule = 1  # flights of each start or draw, compared with one another
     guidance: bool = False  # pay R_guidance: the paper's, our form of it (rocket/rewards.py)
-    mass_weight: Schedule = 0.0  # cut-off: factor on `mass_rewards`, which compare flights of one start
+    mass_weight: Schedule = 0.0  # where the engine cuts off at the target's energy: factor on `mass_rewards`
     weight_average: float = 0.0  # decay, per optimiser step, of the averaged weights used in evaluation
 
 
-# Recipes: the values of Args that we replace (why: docs/decisions.md) -------------------------------------------------
+# Recipes: the values that we replace (beside Table 1's: docs/decisions.md; trials: docs/training-notes.md) ------------
 OURS = {
     "num_blocks": 2,  # a laptop's network, a hundredth of Table 1's weights
     "embed_dim": 64,
@@ -113,19 +119,18 @@ OURS = {
     "update_epochs": 6,
     "learning_rate": 3e-3,
     "lr_times_std": True,
-    "gamma": 1.0,  # 0.99 is a horizon of 200 s, and what is steered early is paid at the end
+    "gamma": 1.0,  # 0.99 looks 100 steps of 2 s ahead; early steering is paid at the end
     "gae_lambda": "0:0.985 1:1",
     "clip_coef": 0.2,
-    "ent_coef": 0.0,
     "vf_coef": 0.5,
     "target_kl": 0.02,
     "flights_per_start": 32,  # there is one start: all flights of an update are compared
 }
 CUTOFF = {
     **OURS,
-    "total_updates": 340,
+    "total_updates": 380,
     "memory_noise": "0:0.01 1:0",
-    "log_std": "0:-1 0.85:-6.4 1:-8",
+    "log_std": "0:-1 0.75:-5.8 1:-8",
     "mass_weight": "0.1:0 0.2:2 0.5:2 0.85:0",  # not before the orbit is reached; at the end the orbit alone counts
     "weight_average": 0.998,
 }
@@ -148,7 +153,7 @@ DISPERSED = {  # replaces more, and goes on with a policy of the nominal flight
     "weight_average": 0.998,
 }
 RECIPES = {"RocketAscent-v0": FIXED, "RocketAscentCutoff-v0": CUTOFF, "TwoStageLEO-v0": CUTOFF}
-FIRST_POLICY = {  # with which a dispersed training begins
+FIRST_POLICY = {  # the policy with which a dispersed training begins, by environment id
     "RocketAscent-v0": "results/rocket_fixed/agent.safetensors",
     "RocketAscentCutoff-v0": "results/rocket_cutoff/agent.safetensors",
     "TwoStageLEO-v0": "results/two_stage_leo/agent.safetensors",
@@ -169,23 +174,22 @@ def recipe(args):
     return {**changes, **DISPERSED, "checkpoint": first_policy}
 
 
-# Problem: input and action --------------------------------------------------------------------------------------------
-# The reward is R_orbital + R_trajectory + R_guidance + R_penalties + R_terminal (rocket/rewards.py). The paper names
-# the five without formulas. R_trajectory has no weight here, R_guidance only with --guidance.
+# Problem: input and action (features, frame and first action are ours) ------------------------------------------------
 ENV_IDS = tuple(ROCKETS)
 ENV_OPTIONS = ("observe_phase", "dispersion", "observe_draw", "observe_mass")  # arguments of the environments
 FIXED_OPTIONS = {"action_frame": "local"}  # those that no flag sets: up, along-track, cross-track
 BUFFERS = {env_id: policy_constants(mission.rocket) for env_id, mission in ROCKETS.items()}  # read as agent.<name>
 INITIAL_ACTION = [1.0, 0.0, 0.0]  # straight up (local frame): a randomly steered rocket never leaves the ground
-
-
 OBSERVED = 9  # numbers that every rocket shows: r, v, m, t_norm, phase; the draw comes after them
-LENGTH = 64  # an Earth radius is about so many 100 km
-SPEED = 8  # its circular speed is about so many km/s
+LENGTH = 64  # in 100 km: about the Earth's radius
+SPEED = 8  # in km/s: about the circular speed at that radius
 
 
 class Motion(NamedTuple):
-    """Where a flight is, (..., k) each; unless said otherwise in Earth radii and circular speeds, which make mu = 1."""
+    """Position and velocity of a flight, and what follows from them.
+
+    Unless a comment says otherwise, lengths are in Earth radii and speeds in circular speeds at that radius: mu = 1.
+    """
 
     r: torch.Tensor  # (..., 3) in the target orbit's axes: to the perigee, along the semi-latus rectum, normal
     v: torch.Tensor  # (..., 3) in the same axes
@@ -229,7 +233,7 @@ def features(agent, obs):
     - the orbit's error, and tanh(10 error), in which small errors show
     - the draw, with --observe-draw
     - what the flight differs by from the nominal one, in units of `differences`, clipped at 10 (tanh would flatten it);
-      zeros before a dispersed training
+      zeros until the agent has a nominal flight
 
     The paper gives the environment's observation alone: r and v in ECI, m, t_norm and the phase.
     """
@@ -247,7 +251,11 @@ def features(agent, obs):
 
 
 def mean_action(output, action_scale):
-    """The policy's mean, a unit vector: the environment normalises the action, a longer mean would be less noise."""
+    """The policy's mean, a unit vector.
+
+    The environment uses only the direction of a sampled action. If the mean could grow longer, the same std would
+    change the direction less: the policy could choose its own noise.
+    """
     return F.normalize(output, dim=-1)
 
 
@@ -262,32 +270,32 @@ def describe(episodes, metrics):
 
 # Problem, ours: what only training changes ----------------------------------------------------------------------------
 def set_curriculum(envs, args, progress):
-    """What only training changes; returns how many flights in a row have the same start, or draw.
+    """Set what only training changes; returns how many flights in a row have the same start, or draw.
 
-    The scale of R_terminal follows a noise that is set: std / 8, at most TERMINAL_SCALE, on dispersed flights at least
-    0.001 (smaller was no better). The noise scatters the ends of the flights by about std / 10.
+    R_terminal = -2 ln(1 + error / scale): below the scale all errors earn almost the same. Noise scatters the errors of
+    the flights by about std / 10. So the scale falls with the noise, as std / 8, if --log-std is a schedule. It is at
+    most TERMINAL_SCALE, and at least 0.001 with --dispersion (less was no better).
     """
     envs.terminal_scale = TERMINAL_SCALE
     if isinstance(args.log_std, str):
-        std = math.exp(at(args.log_std, progress))
+        std = math.exp(value_at(args.log_std, progress))
         smallest = 0.001 if args.dispersion else 0.0
         envs.terminal_scale = min(TERMINAL_SCALE, max(std / 8, smallest))
     envs.guidance = args.guidance
-    envs.flights_per_start = round(at(args.flights_per_start, progress))
-    return envs.flights_per_start
+    group = round(value_at(args.flights_per_start, progress))
+    envs.flights_per_start = group
+    return group
 
 
 def add_rewards(envs, args, progress, batch, episodes):
     """With cut-off, add `mass_rewards` to the flights' last steps."""
-    if not envs.cutoff:
+    weight = value_at(args.mass_weight, progress)
+    if not envs.cutoff or weight == 0:
         return
-    weight = at(args.mass_weight, progress)
-    if weight == 0:
-        return
-    one_start = len(episodes["error"])  # without dispersion all flights, of all processes, are one group
-    group_size = envs.flights_per_start if args.dispersion else one_start
-    paid = weight * mass_rewards(episodes, envs.rocket, envs.terminal_scale, group_size)
-    paid = runs.local_shard(paid, envs.num_envs)  # of this process's flights
+    all_flights = len(episodes["error"])  # of all processes
+    group = envs.flights_per_start if args.dispersion else all_flights  # without dispersion all have the same start
+    paid = weight * mass_rewards(episodes, envs.rocket, envs.terminal_scale, group)
+    paid = runs.local_shard(paid, envs.num_envs)  # the part of this process's flights
     last_step = batch.alive.sum(0).long() - 1  # (N,)
     flight = torch.arange(envs.num_envs)
     batch.rewards[last_step, flight] += torch.as_tensor(paid * args.reward_scale).to(batch.rewards)
@@ -300,19 +308,23 @@ def compared(m):
 
 
 def nominal_at(agent, phase, energy):
-    """The nominal flight's `compared` (..., 8) in a phase at an energy (..., 1) each.
+    """The nominal flight's `compared` (..., 8) at the same phase and energy as these flights, (..., 1) each.
 
-    At one energy of one burn two flights are equally far on their way, whatever the time, and what still has to be
-    added to their orbits is nearly the same. So what their orbits differ by here they will differ by at the end.
-    Linear between the rows of `nominal_flight`, one a step, and extrapolated beyond those of a burn.
+    Flights are matched by energy and not by time. Two flights with the same energy in the same burn have equally much
+    energy still to gain, and what they will still add to their orbits is nearly the same. So the difference of their
+    orbits now is about their difference at the end.
+
+    `nominal_flight` has one row for each step. Between two rows of a burn the values are linear in the energy; beyond
+    a burn's first or last row the nearest two rows are extrapolated. Energies are between -1 and 0 and rise within a
+    burn, so burn + energy rises over the whole flight: one sorted key finds the row.
     """
     rows = agent.nominal_flight
     burn = (phase * (len(agent.phases) - 1)).round().contiguous()
     key = (burn + energy).contiguous()
-    burns, energies = rows[:, 0].contiguous(), rows[:, 1].contiguous()
+    burns, energies = rows[:, 0].contiguous(), rows[:, 1].contiguous()  # searchsorted warns of any other layout
     first_of_burn = torch.searchsorted(burns, burn)
     last_of_burn = torch.searchsorted(burns, burn, right=True) - 1
-    after = torch.searchsorted(burns + energies, key)  # sorted: energies rise within a burn, from -1 to 0
+    after = torch.searchsorted(burns + energies, key)  # the first row whose key is not smaller
     after = torch.minimum(torch.maximum(after, first_of_burn + 1), last_of_burn).clamp(min=1)[..., 0]
     share = (energy - rows[after - 1, 1:2]) / (rows[after, 1:2] - rows[after - 1, 1:2]).clamp(min=1e-7)
     return torch.lerp(rows[after - 1, 2:], rows[after, 2:], share)
@@ -320,15 +332,14 @@ def nominal_at(agent, phase, energy):
 
 @torch.no_grad()
 def before_training(agent, args, env_options):
-    """Where a dispersed training begins with a policy of the nominal flight: let it fly that flight, and keep it.
+    """Before a dispersed training: let the policy that it begins with fly the nominal flight, and store that flight.
 
-    The weights on what is new to the policy, the draw and the differences, begin at zero: at first it flies as before.
+    The draw and the differences are new inputs to that policy. Their weights are set to 0, so at first it flies as
+    before.
     """
-    begins = args.checkpoint is not None and args.resume is None and not args.eval_only
-    if not (begins and args.dispersion):
+    begins = args.dispersion and args.checkpoint is not None and args.resume is None and not args.eval_only
+    if not begins or agent.nominal_flight.any():  # a policy of a dispersed training has its nominal flight already
         return
-    if agent.nominal_flight.any():
-        return  # that policy has its nominal flight
     envs = gym.make_vec(args.env_id, num_envs=1, **{**env_options, "dispersion": 0.0})
     fly_nominal(agent, agent.make_policy(envs.episode_steps), envs)
     draw = envs.single_observation_space.shape[0] - OBSERVED
@@ -339,10 +350,11 @@ def fly_nominal(agent, policy, envs):
     """Fly `policy(obs, t)` in one environment, and write the flight into the agent's `nominal_flight`."""
     obs, _ = envs.reset()
     flight = [obs]
-    has_ended = [False]
-    while not has_ended[0]:
-        obs, _, has_ended, _ = envs.advance(policy(obs, len(flight) - 1))
+    while True:
+        obs, _, ended, _ = envs.advance(policy(obs, len(flight) - 1))
         flight.append(obs)
+        if ended[0]:
+            break
 
     obs = torch.as_tensor(np.concatenate(flight)).to(agent.nominal_flight)
     m = motion(agent, obs)
@@ -378,7 +390,7 @@ class Gate(nn.Module):
 class RelativeAttention(nn.Module):
     """Multi-head attention over a sliding window: A_ij = (x_i W^Q) (x_j W^K + R_{i-j})^T / sqrt(d_k), i - L <= j <= i.
 
-    R is learned, one vector for each head and distance 0..L; j runs over [memory; segment].
+    R is learned, one vector for each head and distance 0..L; j runs over the memory and the episode.
     """
 
     def __init__(self, embed_dim, num_heads, memory_length):
@@ -393,9 +405,10 @@ class RelativeAttention(nn.Module):
         self.R = nn.Parameter(torch.zeros(num_heads, memory_length + 1, self.dk))
 
     def forward(self, x, memory):
-        """The whole segment at once: x (N, T, d), memory (N, L, d) -> (N, T, d).
+        """MultiHead(x) of whole episodes: x (N, T, d), memory (N, L, d) -> (N, T, d).
 
-        Queries in chunks of C <= max(L / 2, 64) steps, each against its own window of L + C keys: linear in T.
+        The queries are cut into chunks of C <= max(L / 2, 64) steps. Each chunk sees a window of L + C keys, so the
+        cost grows linearly with T.
         """
         N, T, d = x.shape
         L, H, dk = self.memory_length, self.num_heads, self.dk
@@ -418,10 +431,12 @@ class RelativeAttention(nn.Module):
         return self.out(attended[:, :T])
 
     def position_scores(self, q):
-        """q_i R_{i-j}^T of q (N, chunks, H, C, dk) under the keys j of its window, -inf elsewhere: (..., C, L + C).
+        """q_i R_{i-j}^T of q (N, chunks, H, C, dk) for all keys of its window: (..., C, L + C), -inf out of reach.
 
-        Row i's L + 1 products, distance L first, belong under the keys i..i+L: row i has to move right by i. Padded
-        with C columns, laid out as a line and cut anew into rows a column shorter, it does. L = 2, C = 3, "." -inf:
+        Key i + L of a window is query i itself, so query i reaches the keys i to i + L. `products` has a row for each
+        query and a column for each distance, L first: row i has to move right by i. One reshape does it: pad each row
+        with C columns of -inf, join the rows to one line, and cut that into rows which are one column shorter. For
+        L = 2, C = 3 (a2: query a at distance 2; ".": -inf):
 
             a2 a1 a0 .  .  .        a2 a1 a0 .  .
             b2 b1 b0 .  .  .   ->   .  b2 b1 b0 .
@@ -433,10 +448,11 @@ class RelativeAttention(nn.Module):
         return line[..., : C * (L + C)].unflatten(-1, (C, L + C))
 
     def start_cache(self, memory, steps):
-        """What `step` needs: keys and values of the memory (N, L, d), with room for `steps` more; projections; R.
+        """What `step` needs, for episodes of at most `steps` steps with the memory (N, L, d):
 
-        Keys and values are (2, N, H, L + steps, dk), the three projections one matrix (3 d, d), and R is in the order
-        of the window's keys, (H, L + 1, dk).
+        - kv (2, N, H, L + steps, dk), keys and values: the memory's, then room for those of the steps
+        - the projections W^Q / sqrt(dk), W^K and W^V as one matrix (3 d, d)
+        - R (H, L + 1, dk), distance L first, as the window's keys are ordered
         """
         kv = torch.stack([self.key(memory), self.value(memory)])  # (2, N, L, d)
         kv = kv.unflatten(-1, (self.num_heads, self.dk)).transpose(2, 3)  # (2, N, H, L, dk)
@@ -482,9 +498,10 @@ LOG_STD_RANGE = (-8.0, 0.5)
 class Agent(nn.Module):
     """Actor and critic on one GTrXL trunk. The Gaussian policy has one log-std for all states, learned or set.
 
-    A block's memory at step t is its own inputs of the steps t - L to t - 1, and m_0 before the first. A rollout keeps
-    them as keys and values (`encode_step`); training computes whole episodes anew from m_0 (`encode`). So lines 10, 11
-    and 17 need no stored m_t, and gradients flow over the window. Line 10's a_t does not enter: states tell it.
+    A block's memory at step t is what the block received at the steps t - L to t - 1, and m_0 before the first step.
+    A rollout stores it as keys and values (`encode_step`). Training stores only m_0, and computes the whole episode
+    again from it with the current weights (`encode`); so gradients flow through the memory. This replaces lines 10, 11
+    and 17. Line 10 also stores the action a_t. We leave it out: two states that are fully observed tell the action.
     """
 
     def __init__(self, args, envs):
@@ -499,7 +516,7 @@ class Agent(nn.Module):
         constants = {**BUFFERS[args.env_id], "action_scale": envs.single_action_space.high.tolist()}
         for name, value in constants.items():
             self.register_buffer(name, torch.tensor(value))
-        any_observation = torch.ones(envs.single_observation_space.shape)  # zeros have no direction
+        any_observation = torch.ones(envs.single_observation_space.shape)  # only the number of its features is used
         inputs = len(features(self, any_observation))
 
         self.encoder = nn.Sequential(linear(inputs, d, gain=2**0.5), nn.GELU())
@@ -509,12 +526,12 @@ class Agent(nn.Module):
         self.actor[-1].bias.data = torch.tensor(INITIAL_ACTION)
         self.critic = nn.Sequential(linear(d, hidden, gain=2**0.5), nn.GELU(), linear(hidden, 1))
         learned = not isinstance(args.log_std, str)  # a number: learned from there; points: set by them
-        self.actor_logstd = nn.Parameter(torch.full((actions,), at(args.log_std, 0.0)), requires_grad=learned)
+        self.actor_logstd = nn.Parameter(torch.full((actions,), value_at(args.log_std, 0.0)), requires_grad=learned)
 
     def new_memory(self, num_envs, noise):
         """m_0 ~ N(0, noise^2), drawn once per episode and block: (blocks, N, L, d)."""
         zeros = self.actor_logstd.new_zeros(self.num_blocks, num_envs, self.memory_length, self.embed_dim)
-        return zeros.normal_(std=noise) if noise else zeros  # an evaluation must not move the random stream
+        return zeros.normal_(std=noise) if noise else zeros  # without noise nothing is drawn
 
     def encode(self, obs, memory):
         """Whole episodes in parallel (training): obs (N, T, obs), memory (blocks, N, L, d) -> hidden (N, T, d)."""
@@ -546,7 +563,7 @@ class Agent(nn.Module):
         return Normal(mean, std.expand_as(mean), validate_args=False)
 
     def evaluate_actions(self, hidden, actions):
-        """log pi(a|s), the policy's entropy and the critic's output, (...) each, of hidden (..., d), (..., actions)."""
+        """log pi(a|s), entropy and critic's output, (...) each, of hidden (..., d) and actions (..., actions)."""
         probs = self.get_policy(hidden)
         logprob = probs.log_prob(actions).sum(-1)
         entropy = probs.entropy().sum(-1)
@@ -554,7 +571,10 @@ class Agent(nn.Module):
         return logprob, entropy, value
 
     def make_policy(self, steps):
-        """What evaluation flies: obs (N, obs), t -> mean actions (N, actions), in NumPy; its memory begins as zeros."""
+        """The function policy(obs (N, obs), t) -> mean actions (N, actions), in NumPy, that evaluation flies.
+
+        At t = 0 it begins new episodes, with a memory of zeros.
+        """
         dtype, device = self.actor_logstd.dtype, self.actor_logstd.device
         cache = []
 
@@ -586,7 +606,7 @@ class Batch:
 
 @torch.no_grad()
 def rollout(agent, envs, reward_scale, memory_noise):
-    """One episode in each environment (Algorithm 1, lines 3-13): the Batch and all processes' `final_info`."""
+    """Fly one episode in each environment (lines 3-13): this process's Batch, and all processes' `final_info`."""
     T, N = envs.episode_steps, envs.num_envs
     zeros = agent.actor_logstd.new_zeros  # on the agent's device, in its precision
     batch = Batch(
@@ -603,14 +623,14 @@ def rollout(agent, envs, reward_scale, memory_noise):
     alive = np.ones(N, dtype=bool)
     episodes = {}  # `final_info` of each environment's first episode
     next_obs, _ = envs.reset()
-    batch.obs[:] = torch.as_tensor(next_obs)  # steps that nobody lives to are computed, too: they need a real state
+    batch.obs[:] = torch.as_tensor(next_obs)  # after the last episode's end: features of zeros could be NaN
 
     for t in range(T):  # line 6
         batch.obs[t] = torch.as_tensor(next_obs)
         batch.alive[t] = torch.as_tensor(alive)
         hidden[t] = agent.encode_step(batch.obs[t], cache, t)  # lines 7 and 10
         batch.actions[t] = agent.get_policy(hidden[t]).sample()  # line 8
-        # line 9; the horizon is a true end, because time is observed: nothing is truncated, nothing bootstrapped
+        # line 9; an episode's end is a true end: V is 0 there, and nothing is ever truncated
         next_obs, reward, terminated, _, info = envs.step(batch.actions[t].cpu().numpy())
         batch.rewards[t] = torch.as_tensor(reward * alive * reward_scale)
         ended = alive & terminated
@@ -621,7 +641,8 @@ def rollout(agent, envs, reward_scale, memory_noise):
         if not alive.any():
             break
 
-    batch.logprobs, _, batch.critic = agent.evaluate_actions(hidden, batch.actions)  # v_t of line 8
+    # v_t of line 8 and log pi(a_t), for all steps in one call: sampling needs neither
+    batch.logprobs, _, batch.critic = agent.evaluate_actions(hidden, batch.actions)
     of_each_process = runs.all_gather(episodes)
     all_episodes = {key: np.concatenate([part[key] for part in of_each_process]) for key in episodes}
     return batch, all_episodes
@@ -630,15 +651,12 @@ def rollout(agent, envs, reward_scale, memory_noise):
 def gae(rewards, values, alive, gamma, gae_lambda):
     """A_t = sum_l (gamma lambda)^l delta_{t+l} and the returns A + V, all (T, N); V is 0 beyond an episode's end."""
     advantages = torch.zeros_like(rewards)
-    lastgaelam = 0.0
-    next_value = torch.zeros_like(values[0])
-    next_alive = torch.zeros_like(alive[0])
+    lastgaelam = next_value = torch.zeros_like(values[0])
     for t in reversed(range(len(rewards))):
-        delta = rewards[t] + gamma * next_value * next_alive - values[t]
-        lastgaelam = (delta + gamma * gae_lambda * next_alive * lastgaelam) * alive[t]
+        delta = rewards[t] + gamma * next_value - values[t]
+        lastgaelam = (delta + gamma * gae_lambda * lastgaelam) * alive[t]
         advantages[t] = lastgaelam
-        next_value = values[t]
-        next_alive = alive[t]
+        next_value = values[t] * alive[t]  # 0 beyond the episode's end
     return advantages, advantages + values
 
 
@@ -695,7 +713,7 @@ def ppo_loss(agent, batch, mb, clip_coef, vf_coef, ent_coef):
 
 
 # Shared, ours: what we add to PPO -------------------------------------------------------------------------------------
-def at(schedule, progress):
+def value_at(schedule, progress):
     """The value of "0:-1 0.4:-2 1:-6" at `progress`, 0 in the first update and 1 in the last; a number is constant.
 
     Linear between the points; of two points at one place the second counts from there on.
@@ -709,33 +727,38 @@ def at(schedule, progress):
 
 
 def set_log_std(agent, args, progress):
-    """Set the log-std of this update, where points of --log-std set it; keep a learned one where it has a gradient."""
+    """Set the log-std of this update if --log-std is a schedule; clamp it if it is learned.
+
+    Beyond LOG_STD_RANGE the clamp in `get_policy` has no gradient, so a learned log-std would never come back.
+    """
     if agent.actor_logstd.requires_grad:
-        agent.actor_logstd.data.clamp_(*LOG_STD_RANGE)  # beyond it get_policy's clamp leaves no gradient
+        agent.actor_logstd.data.clamp_(*LOG_STD_RANGE)
     else:
-        agent.actor_logstd.data.fill_(at(args.log_std, progress))
+        agent.actor_logstd.data.fill_(value_at(args.log_std, progress))
 
 
 def learning_rate_of(agent, args, progress):
-    """The learning rate of this update; with --lr-times-std in proportion to the policy's standard deviation.
+    """The learning rate of this update; with --lr-times-std it is multiplied by the policy's standard deviation.
 
-    Means that differ by delta have a KL divergence of delta^2 / (2 std^2), and a step of Adam moves the mean by about
-    the learning rate, whatever the std. With a rate in proportion to it a step has the same KL at any noise. So the
-    noise can fall by a factor of hundreds, and the policy still learns.
+    Two policies whose means differ by delta have the KL divergence delta^2 / (2 std^2). A step of Adam moves each
+    weight by about the learning rate, so it moves the mean by an amount in proportion to the learning rate. If the
+    learning rate is in proportion to the std, a step changes the policy by about the same KL at any noise, and the
+    policy still learns when the noise is small.
     """
-    learning_rate = at(args.learning_rate, progress)
+    learning_rate = value_at(args.learning_rate, progress)
     if not args.lr_times_std:
         return learning_rate
     return learning_rate * agent.actor_logstd.exp().mean().item()
 
 
 def linear_fit(x, y, alive):
-    """Ridge regression of y (..., G) on x (..., G, k) over the G episodes of a group that live: the fitted y.
+    """The value that a linear regression predicts for y (..., G) from x (..., G, k), over a group's G episodes.
 
-    Each episode is in its own fit, which shrinks its residual by the factor 1 - l, its leverage l. With lambda = 1 this
-    keeps the direction of a state's expected gradient, because l depends on the states at this step and not on the
-    action; extreme states count less. With a smaller lambda that is approximate. (Fits that leave the episode out were
-    worse: docs/training-notes.md.)
+    Only living episodes count. The regression has a small ridge penalty. An episode's own return is part of its fit.
+    So its residual is smaller by the factor 1 - leverage, and an episode in an extreme state counts less. The leverage
+    depends on the states of this step and not on the action. So with --gae-lambda 1 the expected policy gradient of a
+    state keeps its direction; below 1 this holds only approximately. Fits that leave the episode out were worse:
+    docs/training-notes.md.
     """
     x, y = x.double(), y.double()[..., None]
     weight = alive.double()[..., None]  # (..., G, 1)
@@ -743,23 +766,27 @@ def linear_fit(x, y, alive):
     y_mean = (y * weight).sum(-2, keepdim=True) / count
     x = (x - (x * weight).sum(-2, keepdim=True) / count) * weight  # centred
     x = x / ((x * x).sum(-2, keepdim=True) / count).sqrt().add(1e-6)  # of unit spread
-    ridge = 0.01 * count * torch.eye(x.shape[-1]).to(x)  # what all episodes share has no slope
+    # a column that is equal in all episodes (the time) is zero here; the ridge keeps the matrix invertible
+    ridge = 0.01 * count * torch.eye(x.shape[-1]).to(x)
     slope = torch.linalg.solve(x.mT @ x + ridge, x.mT @ (y - y_mean))
     fitted = y_mean + x @ slope  # (..., G, 1)
     return fitted[..., 0].to(alive.dtype)
 
 
 def returns_baseline(batch, gamma, group):
-    """b (T, N) and c (T, 1) of the value V(s_t) = b_t + c_t critic(s_t). The paper's: b = 0, c = 1; so with group 1.
+    """The baseline (T, N) and the scale (T, 1) of the value V(s_t) = baseline_t + scale_t * critic(s_t).
 
-    Each `group` of episodes that follow one another flew the same start. b regresses their returns from step t on
-    linearly on the states that they have reached by then. c is the spread of what is left at step t, over all flights,
-    and 0.3 of its mean over the steps, added as squares: without it steps of hardly any spread would be blown up. With
-    small noise a critic's error is larger than what an action changes; comparing flights of one start shows it.
+    The paper has V = critic: baseline 0, scale 1. So it is here with group 1. With small noise the critic's error is
+    larger than the effect of an action. Flights of one start, compared with one another, still show that effect.
 
-    Relatives: the mean return of other samples of the same question as the baseline (RLOO, Kool et al. 2019), or of the
-    whole group, in units of its spread (GRPO, Shao et al. 2024). They have one return a sample, we one a step; hence
-    the regression on the state, a linear control variate.
+    Each `group` of neighbouring episodes flew the same start. Their returns from step t on are regressed linearly on
+    their observations at step t; the fit is the baseline. What it leaves over has a spread at each step, taken over
+    all flights of all groups. scale^2 is the spread^2 of the step plus (0.3 x the mean spread of the steps)^2: without
+    the second term a step of almost no spread would be divided by almost 0.
+
+    RLOO (Kool et al. 2019) takes the mean return of other samples of the same question as the baseline; GRPO (Shao et
+    al. 2024) takes that of the whole group, and divides by its spread. They have one return for each sample. Here each
+    step has one, hence the regression on the state, a linear control variate.
     """
     if group == 1:
         return torch.zeros_like(batch.rewards), torch.ones_like(batch.rewards[:, :1])
@@ -775,6 +802,14 @@ def returns_baseline(batch, gamma, group):
 
 
 # Shared: training (Algorithm 1) and main ------------------------------------------------------------------------------
+def minibatches(args, envs, device):
+    """(epoch, minibatch, episodes) of lines 15 and 16: in each epoch every episode once, in a new order."""
+    for epoch in range(1, args.update_epochs + 1):
+        order = torch.randperm(envs.num_envs, device=device)
+        for minibatch, mb in enumerate(order.tensor_split(args.num_minibatches), start=1):
+            yield epoch, minibatch, mb
+
+
 def train(args, agent, average, optimizer, envs, run):
     """Algorithm 1, its lines beside ours. `run` counts, logs, saves and evaluates; it changes nothing that is learned.
 
@@ -783,9 +818,9 @@ def train(args, agent, average, optimizer, envs, run):
     target_kl = math.inf if args.target_kl is None else args.target_kl
     for iteration in range(run.updates_done + 1, args.total_updates + 1):  # line 2
         progress = (iteration - 1) / max(args.total_updates - 1, 1)
-        memory_noise = at(args.memory_noise, progress)
-        gae_lambda = at(args.gae_lambda, progress)
-        ent_coef = at(args.ent_coef, progress)
+        memory_noise = value_at(args.memory_noise, progress)
+        gae_lambda = value_at(args.gae_lambda, progress)
+        ent_coef = value_at(args.ent_coef, progress)
         set_log_std(agent, args, progress)
         learning_rate = learning_rate_of(agent, args, progress)
         optimizer.param_groups[0]["lr"] = learning_rate
@@ -807,22 +842,19 @@ def train(args, agent, average, optimizer, envs, run):
 
         # lines 15-18: epochs of minibatches
         log = []
-        for epoch in range(1, args.update_epochs + 1):  # line 15
-            order = torch.randperm(envs.num_envs, device=advantages.device)
-            for minibatch, mb in enumerate(order.tensor_split(args.num_minibatches), start=1):  # line 16
-                loss, losses = ppo_loss(agent, batch, mb, args.clip_coef, args.vf_coef, ent_coef)
-                log.append(losses)
-                if losses["approx_kl"] > target_kl:
-                    break
-                optimizer.zero_grad()  # line 18
-                loss.backward()
-                runs.sum_gradients(agent)  # over torchrun's processes
-                gradient_norm = nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
-                runs.refuse_nan({**losses, "gradient norm": gradient_norm}, epoch, minibatch)
-                optimizer.step()
-                average.update_parameters(agent)  # ours: what evaluation flies
+        for epoch, minibatch, mb in minibatches(args, envs, advantages.device):  # lines 15 and 16
+            loss, losses = ppo_loss(agent, batch, mb, args.clip_coef, args.vf_coef, ent_coef)
+            runs.refuse_nan(losses, epoch, minibatch)
+            log.append(losses)
             if losses["approx_kl"] > target_kl:
-                break  # the minibatch that went too far has taken no step, and ends the update
+                break  # this minibatch takes no step, and ends the update
+            optimizer.zero_grad()  # line 18
+            loss.backward()
+            runs.sum_gradients(agent)  # over torchrun's processes
+            gradient_norm = nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
+            runs.refuse_nan({"gradient norm": gradient_norm}, epoch, minibatch)
+            optimizer.step()
+            average.update_parameters(agent)  # ours: what evaluation flies
 
         means = {name: torch.stack([logged[name] for logged in log]).mean().item() for name in losses}
         means["explained_variance"] = explained_variance(batch.critic, batch.targets, batch.alive)

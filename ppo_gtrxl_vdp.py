@@ -6,8 +6,9 @@
     python ppo_gtrxl_vdp.py --eval-only --checkpoint results/vdp/agent.safetensors
 
 Top to bottom: arguments, recipes, problem, Gated Transformer-XL, agent, PPO, what we add to it, training, main.
-From the first "Shared" on, all ppo_gtrxl_*.py are the same to the letter. "Ours" is what the paper does not have.
-T steps, N environments (Algorithm 1: E), L memory length, d width, H heads, dk = d / H.
+From the first "Shared" on, all ppo_gtrxl_*.py are the same to the letter. A section with "ours" in its heading has
+nothing from the paper; elsewhere a comment says so. T steps, N environments (Algorithm 1 calls these E, and its
+iterations N), L memory length, d width, H heads, dk = d / H.
 """
 
 from __future__ import annotations
@@ -27,16 +28,18 @@ import runs
 from runs import Schedule, all_reduce_sum
 
 
-# A schedule is a number, or "place:value place:value": place 0 is the first update, 1 the last; linear between the
-# points, constant before the first and after the last. Two points at one place are a jump.
 @dataclass
 class Args:
-    """The arguments; by default Table 1's column of this problem. RECIPES has what we change."""
+    """The flags. The values written here are Table 1's column of this problem: --recipe paper uses them as they are.
+
+    --recipe ours, the default, first replaces those in RECIPES. A flag that is typed wins over both. A Schedule is one
+    number, or points "place:value place:value ...": place 0 is the first update, 1 the last (`value_at` reads it).
+    """
 
     # experiment
     exp_name: str = Path(__file__).stem  # the name of this experiment
     seed: int = 1  # seed of the experiment
-    recipe: str = "ours"  # what no flag sets: ours (RECIPES) or paper (plain PPO with Table 1, as the defaults below)
+    recipe: str = "ours"  # the flags that are not typed: "ours" (RECIPES, then these) or "paper" (these)
     torch_deterministic: bool = True  # if toggled, `torch.backends.cudnn.deterministic=True`
     cuda: bool = True  # if toggled, a GPU is used when there is one
     num_threads: int = 1  # CPU threads of torch (0: torch's own choice); bits depend on it
@@ -82,9 +85,9 @@ class Args:
     norm_adv: bool = True  # normalise the advantages over an update
     max_grad_norm: float = 0.5  # the maximum norm for the gradient clipping
     target_kl: float | None = None  # the KL divergence from which an update takes no further step (none: no limit)
-    log_std: Schedule = -0.5  # log of the std in the action's unit. A number: learned from there; points: set
+    log_std: Schedule = -0.5  # log of the std in the action's unit. A number: learned from there; points: not learned
     memory_noise: Schedule = 0.1  # std of the memory before an episode (Algorithm 1, line 5; the text says "small")
-    reward_scale: float = 1.0  # factor on the rewards in training; everything logged is unscaled
+    reward_scale: float = 1.0  # factor on the rewards in training; losses are logged with it, returns without
 
     # ours: off here, on in RECIPES
     lr_times_std: bool = False  # the learning rate is --learning-rate times the policy's std
@@ -93,8 +96,9 @@ class Args:
     weight_average: float = 0.0  # decay, per optimiser step, of the averaged weights used in evaluation
 
 
-# Recipes: the values of Args that we replace (why: docs/decisions.md) -------------------------------------------------
-# The noise falls as a learned one was seen to fall, until flights are compared in groups; from there evenly to little.
+# Recipes: the values that we replace (beside Table 1's: docs/decisions.md; trials: docs/training-notes.md) ------------
+# --log-std falls as a learned one did in earlier trainings, until flights are compared in groups. There it jumps down,
+# and from there it falls linearly. --flights-per-start, --log-std and --log-radius jump at the same place.
 OURS = {
     "gae_lambda": "0:0.95 1:1",
     "target_kl": 0.05,
@@ -130,14 +134,14 @@ RECIPES = {
 
 
 def recipe(args):
-    """What our recipe changes for the environment of `args`; one without a recipe takes the first."""
+    """What our recipe changes for the environments of `args`; an id without a recipe takes the first."""
     return RECIPES.get(args.env_id, RECIPES[ENV_IDS[0]])
 
 
 # Problem: input and action --------------------------------------------------------------------------------------------
 ENV_IDS = ("VanDerPol-v0", "VanDerPolWaypoints-v0")
 ENV_OPTIONS = ("observe_phase", "observe_velocity")  # arguments of the environments
-FIXED_OPTIONS = {}  # those that no flag sets
+FIXED_OPTIONS = {}  # those that no flag sets (the rocket's script has one)
 SIZES = dict(zip(ENV_IDS, (3, 6)))  # of an observation
 BUFFERS = {env_id: {"observation_scale": [1.0] * n} for env_id, n in SIZES.items()}  # `features` reads agent.<name>
 INITIAL_ACTION = [0.0]  # the policy's output before training, in units of the bound
@@ -149,7 +153,7 @@ def features(agent, obs):
 
 
 def mean_action(output, action_scale):
-    """The policy's mean in the action's unit; the environment clips it at the bound."""
+    """The policy's mean, in the action's unit. It has no bound: the environment clips the action."""
     return output * action_scale
 
 
@@ -161,28 +165,32 @@ def describe(episodes, metrics):
 
 
 # Problem, ours: what only training changes ----------------------------------------------------------------------------
-def set_curriculum(envs, args, progress):
-    """What only training changes, all of it ours; returns how many flights in a row have the same start.
+BONUS_WIDTH = 0.4
 
-    Many starts at first, later each one several times. The waypoints' circles are wide at first, so that a flight finds
-    them, and shrink. Compared flights aim at circles a tenth smaller, because the optimum lies on the last one's edge.
-    A miss then costs 62 to 100 a unit of distance (25 to 40 over 0.4): more than it saves (`circle_price` of
-    baselines.py: 7), but not so much that it hides the cost.
+
+def set_curriculum(envs, args, progress):
+    """Set what only training changes; returns how many flights in a row have the same start.
+
+    At first every flight has its own start; later several share one, and are compared. A waypoint's circle is wide at
+    first, so that flights find it, and shrinks to its true radius. Compared flights aim at circles a tenth smaller: the
+    optimum ends on the last circle's edge, where a flight with noise would miss half the time. Beyond the circle their
+    bonus falls to 0 over BONUS_WIDTH, by 25 / 0.4 = 62 to 40 / 0.4 = 100 for each unit of distance. A miss saves at
+    most 7 a unit (`circle_price` of baselines.py), so it does not pay. A steeper fall would hide the cost.
     """
-    group = round(at(args.flights_per_start, progress))
+    group = round(value_at(args.flights_per_start, progress))
     envs.flights_per_start = group
     if envs.problem.waypoints:
-        envs.radius_scale = math.exp(at(args.log_radius, progress))
-        envs.bonus_width = 0.4 if group > 1 else 0.0
+        envs.radius_scale = math.exp(value_at(args.log_radius, progress))
+        envs.bonus_width = BONUS_WIDTH if group > 1 else 0.0
     return group
 
 
 def add_rewards(envs, args, progress, batch, episodes):
-    """Nothing: training is paid what the environment pays."""
+    """Nothing to do here: training is paid what the environment pays. The rocket's script adds to it."""
 
 
 def before_training(agent, args, env_options):
-    """Nothing: no constant of these problems is found by flying."""
+    """Nothing to do here. The rocket's script prepares its agent for flights that differ."""
 
 
 # Shared: Gated Transformer-XL ("Gated Transformer-XL Implementation") -------------------------------------------------
@@ -210,7 +218,7 @@ class Gate(nn.Module):
 class RelativeAttention(nn.Module):
     """Multi-head attention over a sliding window: A_ij = (x_i W^Q) (x_j W^K + R_{i-j})^T / sqrt(d_k), i - L <= j <= i.
 
-    R is learned, one vector for each head and distance 0..L; j runs over [memory; segment].
+    R is learned, one vector for each head and distance 0..L; j runs over the memory and the episode.
     """
 
     def __init__(self, embed_dim, num_heads, memory_length):
@@ -225,9 +233,10 @@ class RelativeAttention(nn.Module):
         self.R = nn.Parameter(torch.zeros(num_heads, memory_length + 1, self.dk))
 
     def forward(self, x, memory):
-        """The whole segment at once: x (N, T, d), memory (N, L, d) -> (N, T, d).
+        """MultiHead(x) of whole episodes: x (N, T, d), memory (N, L, d) -> (N, T, d).
 
-        Queries in chunks of C <= max(L / 2, 64) steps, each against its own window of L + C keys: linear in T.
+        The queries are cut into chunks of C <= max(L / 2, 64) steps. Each chunk sees a window of L + C keys, so the
+        cost grows linearly with T.
         """
         N, T, d = x.shape
         L, H, dk = self.memory_length, self.num_heads, self.dk
@@ -250,10 +259,12 @@ class RelativeAttention(nn.Module):
         return self.out(attended[:, :T])
 
     def position_scores(self, q):
-        """q_i R_{i-j}^T of q (N, chunks, H, C, dk) under the keys j of its window, -inf elsewhere: (..., C, L + C).
+        """q_i R_{i-j}^T of q (N, chunks, H, C, dk) for all keys of its window: (..., C, L + C), -inf out of reach.
 
-        Row i's L + 1 products, distance L first, belong under the keys i..i+L: row i has to move right by i. Padded
-        with C columns, laid out as a line and cut anew into rows a column shorter, it does. L = 2, C = 3, "." -inf:
+        Key i + L of a window is query i itself, so query i reaches the keys i to i + L. `products` has a row for each
+        query and a column for each distance, L first: row i has to move right by i. One reshape does it: pad each row
+        with C columns of -inf, join the rows to one line, and cut that into rows which are one column shorter. For
+        L = 2, C = 3 (a2: query a at distance 2; ".": -inf):
 
             a2 a1 a0 .  .  .        a2 a1 a0 .  .
             b2 b1 b0 .  .  .   ->   .  b2 b1 b0 .
@@ -265,10 +276,11 @@ class RelativeAttention(nn.Module):
         return line[..., : C * (L + C)].unflatten(-1, (C, L + C))
 
     def start_cache(self, memory, steps):
-        """What `step` needs: keys and values of the memory (N, L, d), with room for `steps` more; projections; R.
+        """What `step` needs, for episodes of at most `steps` steps with the memory (N, L, d):
 
-        Keys and values are (2, N, H, L + steps, dk), the three projections one matrix (3 d, d), and R is in the order
-        of the window's keys, (H, L + 1, dk).
+        - kv (2, N, H, L + steps, dk), keys and values: the memory's, then room for those of the steps
+        - the projections W^Q / sqrt(dk), W^K and W^V as one matrix (3 d, d)
+        - R (H, L + 1, dk), distance L first, as the window's keys are ordered
         """
         kv = torch.stack([self.key(memory), self.value(memory)])  # (2, N, L, d)
         kv = kv.unflatten(-1, (self.num_heads, self.dk)).transpose(2, 3)  # (2, N, H, L, dk)
@@ -314,9 +326,10 @@ LOG_STD_RANGE = (-8.0, 0.5)
 class Agent(nn.Module):
     """Actor and critic on one GTrXL trunk. The Gaussian policy has one log-std for all states, learned or set.
 
-    A block's memory at step t is its own inputs of the steps t - L to t - 1, and m_0 before the first. A rollout keeps
-    them as keys and values (`encode_step`); training computes whole episodes anew from m_0 (`encode`). So lines 10, 11
-    and 17 need no stored m_t, and gradients flow over the window. Line 10's a_t does not enter: states tell it.
+    A block's memory at step t is what the block received at the steps t - L to t - 1, and m_0 before the first step.
+    A rollout stores it as keys and values (`encode_step`). Training stores only m_0, and computes the whole episode
+    again from it with the current weights (`encode`); so gradients flow through the memory. This replaces lines 10, 11
+    and 17. Line 10 also stores the action a_t. We leave it out: two states that are fully observed tell the action.
     """
 
     def __init__(self, args, envs):
@@ -331,7 +344,7 @@ class Agent(nn.Module):
         constants = {**BUFFERS[args.env_id], "action_scale": envs.single_action_space.high.tolist()}
         for name, value in constants.items():
             self.register_buffer(name, torch.tensor(value))
-        any_observation = torch.ones(envs.single_observation_space.shape)  # zeros have no direction
+        any_observation = torch.ones(envs.single_observation_space.shape)  # only the number of its features is used
         inputs = len(features(self, any_observation))
 
         self.encoder = nn.Sequential(linear(inputs, d, gain=2**0.5), nn.GELU())
@@ -341,12 +354,12 @@ class Agent(nn.Module):
         self.actor[-1].bias.data = torch.tensor(INITIAL_ACTION)
         self.critic = nn.Sequential(linear(d, hidden, gain=2**0.5), nn.GELU(), linear(hidden, 1))
         learned = not isinstance(args.log_std, str)  # a number: learned from there; points: set by them
-        self.actor_logstd = nn.Parameter(torch.full((actions,), at(args.log_std, 0.0)), requires_grad=learned)
+        self.actor_logstd = nn.Parameter(torch.full((actions,), value_at(args.log_std, 0.0)), requires_grad=learned)
 
     def new_memory(self, num_envs, noise):
         """m_0 ~ N(0, noise^2), drawn once per episode and block: (blocks, N, L, d)."""
         zeros = self.actor_logstd.new_zeros(self.num_blocks, num_envs, self.memory_length, self.embed_dim)
-        return zeros.normal_(std=noise) if noise else zeros  # an evaluation must not move the random stream
+        return zeros.normal_(std=noise) if noise else zeros  # without noise nothing is drawn
 
     def encode(self, obs, memory):
         """Whole episodes in parallel (training): obs (N, T, obs), memory (blocks, N, L, d) -> hidden (N, T, d)."""
@@ -378,7 +391,7 @@ class Agent(nn.Module):
         return Normal(mean, std.expand_as(mean), validate_args=False)
 
     def evaluate_actions(self, hidden, actions):
-        """log pi(a|s), the policy's entropy and the critic's output, (...) each, of hidden (..., d), (..., actions)."""
+        """log pi(a|s), entropy and critic's output, (...) each, of hidden (..., d) and actions (..., actions)."""
         probs = self.get_policy(hidden)
         logprob = probs.log_prob(actions).sum(-1)
         entropy = probs.entropy().sum(-1)
@@ -386,7 +399,10 @@ class Agent(nn.Module):
         return logprob, entropy, value
 
     def make_policy(self, steps):
-        """What evaluation flies: obs (N, obs), t -> mean actions (N, actions), in NumPy; its memory begins as zeros."""
+        """The function policy(obs (N, obs), t) -> mean actions (N, actions), in NumPy, that evaluation flies.
+
+        At t = 0 it begins new episodes, with a memory of zeros.
+        """
         dtype, device = self.actor_logstd.dtype, self.actor_logstd.device
         cache = []
 
@@ -418,7 +434,7 @@ class Batch:
 
 @torch.no_grad()
 def rollout(agent, envs, reward_scale, memory_noise):
-    """One episode in each environment (Algorithm 1, lines 3-13): the Batch and all processes' `final_info`."""
+    """Fly one episode in each environment (lines 3-13): this process's Batch, and all processes' `final_info`."""
     T, N = envs.episode_steps, envs.num_envs
     zeros = agent.actor_logstd.new_zeros  # on the agent's device, in its precision
     batch = Batch(
@@ -435,14 +451,14 @@ def rollout(agent, envs, reward_scale, memory_noise):
     alive = np.ones(N, dtype=bool)
     episodes = {}  # `final_info` of each environment's first episode
     next_obs, _ = envs.reset()
-    batch.obs[:] = torch.as_tensor(next_obs)  # steps that nobody lives to are computed, too: they need a real state
+    batch.obs[:] = torch.as_tensor(next_obs)  # after the last episode's end: features of zeros could be NaN
 
     for t in range(T):  # line 6
         batch.obs[t] = torch.as_tensor(next_obs)
         batch.alive[t] = torch.as_tensor(alive)
         hidden[t] = agent.encode_step(batch.obs[t], cache, t)  # lines 7 and 10
         batch.actions[t] = agent.get_policy(hidden[t]).sample()  # line 8
-        # line 9; the horizon is a true end, because time is observed: nothing is truncated, nothing bootstrapped
+        # line 9; an episode's end is a true end: V is 0 there, and nothing is ever truncated
         next_obs, reward, terminated, _, info = envs.step(batch.actions[t].cpu().numpy())
         batch.rewards[t] = torch.as_tensor(reward * alive * reward_scale)
         ended = alive & terminated
@@ -453,7 +469,8 @@ def rollout(agent, envs, reward_scale, memory_noise):
         if not alive.any():
             break
 
-    batch.logprobs, _, batch.critic = agent.evaluate_actions(hidden, batch.actions)  # v_t of line 8
+    # v_t of line 8 and log pi(a_t), for all steps in one call: sampling needs neither
+    batch.logprobs, _, batch.critic = agent.evaluate_actions(hidden, batch.actions)
     of_each_process = runs.all_gather(episodes)
     all_episodes = {key: np.concatenate([part[key] for part in of_each_process]) for key in episodes}
     return batch, all_episodes
@@ -462,15 +479,12 @@ def rollout(agent, envs, reward_scale, memory_noise):
 def gae(rewards, values, alive, gamma, gae_lambda):
     """A_t = sum_l (gamma lambda)^l delta_{t+l} and the returns A + V, all (T, N); V is 0 beyond an episode's end."""
     advantages = torch.zeros_like(rewards)
-    lastgaelam = 0.0
-    next_value = torch.zeros_like(values[0])
-    next_alive = torch.zeros_like(alive[0])
+    lastgaelam = next_value = torch.zeros_like(values[0])
     for t in reversed(range(len(rewards))):
-        delta = rewards[t] + gamma * next_value * next_alive - values[t]
-        lastgaelam = (delta + gamma * gae_lambda * next_alive * lastgaelam) * alive[t]
+        delta = rewards[t] + gamma * next_value - values[t]
+        lastgaelam = (delta + gamma * gae_lambda * lastgaelam) * alive[t]
         advantages[t] = lastgaelam
-        next_value = values[t]
-        next_alive = alive[t]
+        next_value = values[t] * alive[t]  # 0 beyond the episode's end
     return advantages, advantages + values
 
 
@@ -527,7 +541,7 @@ def ppo_loss(agent, batch, mb, clip_coef, vf_coef, ent_coef):
 
 
 # Shared, ours: what we add to PPO -------------------------------------------------------------------------------------
-def at(schedule, progress):
+def value_at(schedule, progress):
     """The value of "0:-1 0.4:-2 1:-6" at `progress`, 0 in the first update and 1 in the last; a number is constant.
 
     Linear between the points; of two points at one place the second counts from there on.
@@ -541,33 +555,38 @@ def at(schedule, progress):
 
 
 def set_log_std(agent, args, progress):
-    """Set the log-std of this update, where points of --log-std set it; keep a learned one where it has a gradient."""
+    """Set the log-std of this update if --log-std is a schedule; clamp it if it is learned.
+
+    Beyond LOG_STD_RANGE the clamp in `get_policy` has no gradient, so a learned log-std would never come back.
+    """
     if agent.actor_logstd.requires_grad:
-        agent.actor_logstd.data.clamp_(*LOG_STD_RANGE)  # beyond it get_policy's clamp leaves no gradient
+        agent.actor_logstd.data.clamp_(*LOG_STD_RANGE)
     else:
-        agent.actor_logstd.data.fill_(at(args.log_std, progress))
+        agent.actor_logstd.data.fill_(value_at(args.log_std, progress))
 
 
 def learning_rate_of(agent, args, progress):
-    """The learning rate of this update; with --lr-times-std in proportion to the policy's standard deviation.
+    """The learning rate of this update; with --lr-times-std it is multiplied by the policy's standard deviation.
 
-    Means that differ by delta have a KL divergence of delta^2 / (2 std^2), and a step of Adam moves the mean by about
-    the learning rate, whatever the std. With a rate in proportion to it a step has the same KL at any noise. So the
-    noise can fall by a factor of hundreds, and the policy still learns.
+    Two policies whose means differ by delta have the KL divergence delta^2 / (2 std^2). A step of Adam moves each
+    weight by about the learning rate, so it moves the mean by an amount in proportion to the learning rate. If the
+    learning rate is in proportion to the std, a step changes the policy by about the same KL at any noise, and the
+    policy still learns when the noise is small.
     """
-    learning_rate = at(args.learning_rate, progress)
+    learning_rate = value_at(args.learning_rate, progress)
     if not args.lr_times_std:
         return learning_rate
     return learning_rate * agent.actor_logstd.exp().mean().item()
 
 
 def linear_fit(x, y, alive):
-    """Ridge regression of y (..., G) on x (..., G, k) over the G episodes of a group that live: the fitted y.
+    """The value that a linear regression predicts for y (..., G) from x (..., G, k), over a group's G episodes.
 
-    Each episode is in its own fit, which shrinks its residual by the factor 1 - l, its leverage l. With lambda = 1 this
-    keeps the direction of a state's expected gradient, because l depends on the states at this step and not on the
-    action; extreme states count less. With a smaller lambda that is approximate. (Fits that leave the episode out were
-    worse: docs/training-notes.md.)
+    Only living episodes count. The regression has a small ridge penalty. An episode's own return is part of its fit.
+    So its residual is smaller by the factor 1 - leverage, and an episode in an extreme state counts less. The leverage
+    depends on the states of this step and not on the action. So with --gae-lambda 1 the expected policy gradient of a
+    state keeps its direction; below 1 this holds only approximately. Fits that leave the episode out were worse:
+    docs/training-notes.md.
     """
     x, y = x.double(), y.double()[..., None]
     weight = alive.double()[..., None]  # (..., G, 1)
@@ -575,23 +594,27 @@ def linear_fit(x, y, alive):
     y_mean = (y * weight).sum(-2, keepdim=True) / count
     x = (x - (x * weight).sum(-2, keepdim=True) / count) * weight  # centred
     x = x / ((x * x).sum(-2, keepdim=True) / count).sqrt().add(1e-6)  # of unit spread
-    ridge = 0.01 * count * torch.eye(x.shape[-1]).to(x)  # what all episodes share has no slope
+    # a column that is equal in all episodes (the time) is zero here; the ridge keeps the matrix invertible
+    ridge = 0.01 * count * torch.eye(x.shape[-1]).to(x)
     slope = torch.linalg.solve(x.mT @ x + ridge, x.mT @ (y - y_mean))
     fitted = y_mean + x @ slope  # (..., G, 1)
     return fitted[..., 0].to(alive.dtype)
 
 
 def returns_baseline(batch, gamma, group):
-    """b (T, N) and c (T, 1) of the value V(s_t) = b_t + c_t critic(s_t). The paper's: b = 0, c = 1; so with group 1.
+    """The baseline (T, N) and the scale (T, 1) of the value V(s_t) = baseline_t + scale_t * critic(s_t).
 
-    Each `group` of episodes that follow one another flew the same start. b regresses their returns from step t on
-    linearly on the states that they have reached by then. c is the spread of what is left at step t, over all flights,
-    and 0.3 of its mean over the steps, added as squares: without it steps of hardly any spread would be blown up. With
-    small noise a critic's error is larger than what an action changes; comparing flights of one start shows it.
+    The paper has V = critic: baseline 0, scale 1. So it is here with group 1. With small noise the critic's error is
+    larger than the effect of an action. Flights of one start, compared with one another, still show that effect.
 
-    Relatives: the mean return of other samples of the same question as the baseline (RLOO, Kool et al. 2019), or of the
-    whole group, in units of its spread (GRPO, Shao et al. 2024). They have one return a sample, we one a step; hence
-    the regression on the state, a linear control variate.
+    Each `group` of neighbouring episodes flew the same start. Their returns from step t on are regressed linearly on
+    their observations at step t; the fit is the baseline. What it leaves over has a spread at each step, taken over
+    all flights of all groups. scale^2 is the spread^2 of the step plus (0.3 x the mean spread of the steps)^2: without
+    the second term a step of almost no spread would be divided by almost 0.
+
+    RLOO (Kool et al. 2019) takes the mean return of other samples of the same question as the baseline; GRPO (Shao et
+    al. 2024) takes that of the whole group, and divides by its spread. They have one return for each sample. Here each
+    step has one, hence the regression on the state, a linear control variate.
     """
     if group == 1:
         return torch.zeros_like(batch.rewards), torch.ones_like(batch.rewards[:, :1])
@@ -607,6 +630,14 @@ def returns_baseline(batch, gamma, group):
 
 
 # Shared: training (Algorithm 1) and main ------------------------------------------------------------------------------
+def minibatches(args, envs, device):
+    """(epoch, minibatch, episodes) of lines 15 and 16: in each epoch every episode once, in a new order."""
+    for epoch in range(1, args.update_epochs + 1):
+        order = torch.randperm(envs.num_envs, device=device)
+        for minibatch, mb in enumerate(order.tensor_split(args.num_minibatches), start=1):
+            yield epoch, minibatch, mb
+
+
 def train(args, agent, average, optimizer, envs, run):
     """Algorithm 1, its lines beside ours. `run` counts, logs, saves and evaluates; it changes nothing that is learned.
 
@@ -615,9 +646,9 @@ def train(args, agent, average, optimizer, envs, run):
     target_kl = math.inf if args.target_kl is None else args.target_kl
     for iteration in range(run.updates_done + 1, args.total_updates + 1):  # line 2
         progress = (iteration - 1) / max(args.total_updates - 1, 1)
-        memory_noise = at(args.memory_noise, progress)
-        gae_lambda = at(args.gae_lambda, progress)
-        ent_coef = at(args.ent_coef, progress)
+        memory_noise = value_at(args.memory_noise, progress)
+        gae_lambda = value_at(args.gae_lambda, progress)
+        ent_coef = value_at(args.ent_coef, progress)
         set_log_std(agent, args, progress)
         learning_rate = learning_rate_of(agent, args, progress)
         optimizer.param_groups[0]["lr"] = learning_rate
@@ -639,22 +670,19 @@ def train(args, agent, average, optimizer, envs, run):
 
         # lines 15-18: epochs of minibatches
         log = []
-        for epoch in range(1, args.update_epochs + 1):  # line 15
-            order = torch.randperm(envs.num_envs, device=advantages.device)
-            for minibatch, mb in enumerate(order.tensor_split(args.num_minibatches), start=1):  # line 16
-                loss, losses = ppo_loss(agent, batch, mb, args.clip_coef, args.vf_coef, ent_coef)
-                log.append(losses)
-                if losses["approx_kl"] > target_kl:
-                    break
-                optimizer.zero_grad()  # line 18
-                loss.backward()
-                runs.sum_gradients(agent)  # over torchrun's processes
-                gradient_norm = nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
-                runs.refuse_nan({**losses, "gradient norm": gradient_norm}, epoch, minibatch)
-                optimizer.step()
-                average.update_parameters(agent)  # ours: what evaluation flies
+        for epoch, minibatch, mb in minibatches(args, envs, advantages.device):  # lines 15 and 16
+            loss, losses = ppo_loss(agent, batch, mb, args.clip_coef, args.vf_coef, ent_coef)
+            runs.refuse_nan(losses, epoch, minibatch)
+            log.append(losses)
             if losses["approx_kl"] > target_kl:
-                break  # the minibatch that went too far has taken no step, and ends the update
+                break  # this minibatch takes no step, and ends the update
+            optimizer.zero_grad()  # line 18
+            loss.backward()
+            runs.sum_gradients(agent)  # over torchrun's processes
+            gradient_norm = nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
+            runs.refuse_nan({"gradient norm": gradient_norm}, epoch, minibatch)
+            optimizer.step()
+            average.update_parameters(agent)  # ours: what evaluation flies
 
         means = {name: torch.stack([logged[name] for logged in log]).mean().item() for name in losses}
         means["explained_variance"] = explained_variance(batch.critic, batch.targets, batch.alive)

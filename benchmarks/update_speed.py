@@ -86,7 +86,7 @@ class Workbench:
 
     def rollout(self):
         args = self.args
-        memory_noise = self.script.at(args.memory_noise, 0.0)
+        memory_noise = self.script.value_at(args.memory_noise, 0.0)
         batch, _ = self.script.rollout(self.agent, self.envs, args.reward_scale, memory_noise)
         return batch
 
@@ -214,7 +214,7 @@ def gathered_epoch(bench, batch, samples):
         clipped = ratio.clamp(1 - args.clip_coef, 1 + args.clip_coef)
         loss = (
             torch.max(-advantages * ratio, -advantages * clipped).mean()
-            - bench.script.at(args.ent_coef, 0.0) * entropy.mean()
+            - bench.script.value_at(args.ent_coef, 0.0) * entropy.mean()
         )
         loss = loss + args.vf_coef * 0.5 * (newvalue - batch.targets[t, n]).square().mean()
         bench.optimizer.zero_grad()

@@ -116,9 +116,9 @@ def test_schedule_is_linear_between_its_points():
     schedule = "0.1:1 0.4:-2 0.4:8 0.9:3"
     expected = {0.0: 1, 0.1: 1, 0.2: 0, 0.3: -1, 0.399: -1.99, 0.4: 8, 0.65: 5.5, 0.9: 3, 1.0: 3}
     for progress, value in expected.items():
-        assert script.at(schedule, progress) == pytest.approx(value), progress
-    assert script.at("0:3e-4 1:3e-5", 0.0) == 3e-4 and script.at("0:3e-4 1:3e-5", 1.0) == 3e-5
-    assert script.at(0.7, 0.3) == 0.7
+        assert script.value_at(schedule, progress) == pytest.approx(value), progress
+    assert script.value_at("0:3e-4 1:3e-5", 0.0) == 3e-4 and script.value_at("0:3e-4 1:3e-5", 1.0) == 3e-5
+    assert script.value_at(0.7, 0.3) == 0.7
 
 
 @pytest.mark.parametrize("name, env_id, first", [

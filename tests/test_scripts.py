@@ -143,7 +143,7 @@ def test_the_papers_recipe_is_table_1(k, script):
     for name, row in TABLE_1.items():
         value, expected = getattr(args, name), row[k]
         if isinstance(expected, tuple):
-            value = script.at(value, 0.0), script.at(value, 1.0)
+            value = script.value_at(value, 0.0), script.value_at(value, 1.0)
         assert value == expected, name
     assert {name: getattr(args, name) for name in TURNED_OFF} == TURNED_OFF
     assert not isinstance(args.log_std, str)  # learned
@@ -321,7 +321,9 @@ def test_smoke_run_logs_the_tags(smoke):
         assert step == updates[-1] and shown == pytest.approx(float(value), rel=1e-6), tag
     rates = [value for _, value in logged["charts/learning_rate"]]
     args = script.Args(**script.recipe(script.Args(env_id=env_id)))
-    expected = [script.at(args.learning_rate, end) * np.exp(script.at(args.log_std, end)) for end in (0.0, 1.0)]
+    expected = [
+        script.value_at(args.learning_rate, end) * np.exp(script.value_at(args.log_std, end)) for end in (0.0, 1.0)
+    ]
     assert rates == pytest.approx(expected, rel=1e-6)
 
 
