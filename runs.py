@@ -170,8 +170,11 @@ def resolve(args, typed, kind, recipe, env_options, buffers):
     if args.checkpoint is None and "checkpoint" in changes:
         first = changes["checkpoint"]
         if not Path(first).is_file():
-            todo = "run this in the repository's folder, or train that policy first and name it by --checkpoint"
-            fail(f"the recipe begins with the policy {first}, which is not there: {todo}")
+            first = str(Path(__file__).parent / first)
+        if not Path(first).is_file():
+            fail(
+                f"the recipe begins with the policy {first}, which is not there: train it first, or name a --checkpoint"
+            )
         _, its_own = read_policy(first, kind, env_options, buffers)
         differing = contradictions(args, typed, its_own)
         if differing:

@@ -96,7 +96,7 @@ def test_sections_are_in_order(path):
     """Arguments, recipes, problem, network, agent, PPO, ours, training and main; the paper's names in the heads."""
     heads = [line.strip("#- ") for line in path.read_text().splitlines() if re.fullmatch(r"# .*-{5,}", line)]
     problem = [head for head in heads if head.startswith("Problem")]
-    assert len(problem) >= 2 and sum("ours" in head for head in problem) == len(problem) - 1
+    assert len(problem) >= 2 and all("ours" in head for head in problem[1:])
     wanted = ["Recipes", *problem, "Gated Transformer-XL", "agent", "PPO (Algorithm 1)", "ours"]
     wanted += ["training (Algorithm 1) and main"]
     assert len(heads) == len(wanted)
@@ -218,11 +218,11 @@ def test_a_dispersed_training_begins_with_the_shipped_policy(monkeypatch, capsys
     assert re.match("--embed-dim 8: .*results/rocket_cutoff.* begins anew", capsys.readouterr().out)
     assert dispersed("--recipe=paper").checkpoint is None
     monkeypatch.chdir(tmp_path)
+    assert dispersed().checkpoint == str(ROOT / "results/rocket_cutoff/agent.safetensors")
+    monkeypatch.setitem(ROCKET.FIRST_POLICY, "RocketAscentCutoff-v0", "results/none/agent.safetensors")
     with pytest.raises(SystemExit) as stop:
         dispersed()
-    assert re.match(
-        "error: .*results/rocket_cutoff/agent.safetensors, which is not there: .*--checkpoint", stop.value.code
-    )
+    assert re.match("error: .*results/none/agent.safetensors, which is not there: .*--checkpoint", stop.value.code)
     assert "\n" not in stop.value.code
 
 
