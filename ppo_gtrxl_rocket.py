@@ -31,6 +31,7 @@ from torch.distributions import Normal
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 import runs
+from cuda_graphs import speed_up
 from envs import ROCKETS
 from rocket.policy_constants import DIFFERENCES, policy_constants
 from rocket.rewards import TERMINAL_SCALE, mass_rewards
@@ -52,7 +53,7 @@ class Args:
     torch_deterministic: bool = True  # if toggled, `torch.backends.cudnn.deterministic=True`
     cuda: bool = True  # if toggled, a GPU is used when there is one
     num_threads: int = 1  # CPU threads of torch (0: torch's own choice); bits depend on it
-    torch_compile: bool = False  # compile the network: a minute or more at the start, quicker updates after it
+    torch_compile: bool = False  # compile the network, on a GPU into CUDA graphs: a slow start, then quick updates
     track: bool = False  # if toggled, this experiment will be tracked with Weights and Biases
     wandb_project_name: str = "ppo-gtrxl"  # the wandb's project name
     wandb_entity: str | None = None  # the entity (team) of wandb's project
@@ -562,6 +563,11 @@ class Agent(nn.Module):
         std = self.actor_logstd.clamp(*LOG_STD_RANGE).exp()
         return Normal(mean, std.expand_as(mean), validate_args=False)
 
+    def act(self, obs, cache, t):
+        """Step t of a rollout: hidden (N, d) and sampled actions (N, actions) of obs (N, obs)."""
+        hidden = self.encode_step(obs, cache, t)  # lines 7 and 10
+        return hidden, self.get_policy(hidden).rsample()  # line 8; a GPU would be waited for by `sample`
+
     def evaluate_actions(self, hidden, actions):
         """log pi(a|s), entropy and critic's output, (...) each, of hidden (..., d) and actions (..., actions)."""
         probs = self.get_policy(hidden)
@@ -613,13 +619,15 @@ def rollout(agent, envs, reward_scale, memory_noise):
         obs=zeros(T, N, *envs.single_observation_space.shape),
         actions=zeros(T, N, *envs.single_action_space.shape),
         logprobs=zeros(T, N),  # set after the flight
-        rewards=zeros(T, N),
+        rewards=zeros(T, N),  # set after the flight
         critic=zeros(T, N),  # set after the flight
-        alive=zeros(T, N),
+        alive=zeros(T, N),  # set after the flight
         memory=agent.new_memory(N, memory_noise),  # line 5
     )
     cache = agent.start_cache(batch.memory, T)
     hidden = zeros(T, N, agent.embed_dim)
+    rewards = np.zeros((T, N))
+    alive_at = np.zeros((T, N))
     alive = np.ones(N, dtype=bool)
     episodes = {}  # `final_info` of each environment's first episode
     next_obs, _ = envs.reset()
@@ -627,12 +635,11 @@ def rollout(agent, envs, reward_scale, memory_noise):
 
     for t in range(T):  # line 6
         batch.obs[t] = torch.as_tensor(next_obs)
-        batch.alive[t] = torch.as_tensor(alive)
-        hidden[t] = agent.encode_step(batch.obs[t], cache, t)  # lines 7 and 10
-        batch.actions[t] = agent.get_policy(hidden[t]).sample()  # line 8
+        alive_at[t] = alive
+        hidden[t], batch.actions[t] = agent.act(batch.obs[t], cache, t)  # lines 7, 8 and 10
         # line 9; an episode's end is a true end: V is 0 there, and nothing is ever truncated
         next_obs, reward, terminated, _, info = envs.step(batch.actions[t].cpu().numpy())
-        batch.rewards[t] = torch.as_tensor(reward * alive * reward_scale)
+        rewards[t] = reward * alive * reward_scale
         ended = alive & terminated
         for key, value in info.get("final_info", {}).items():
             first_episodes = episodes.setdefault(key, np.zeros_like(value))
@@ -641,6 +648,8 @@ def rollout(agent, envs, reward_scale, memory_noise):
         if not alive.any():
             break
 
+    batch.rewards[:] = torch.as_tensor(rewards)
+    batch.alive[:] = torch.as_tensor(alive_at)
     # v_t of line 8 and log pi(a_t), for all steps in one call: sampling needs neither
     batch.logprobs, _, batch.critic = agent.evaluate_actions(hidden, batch.actions)
     of_each_process = runs.all_gather(episodes)
@@ -650,6 +659,8 @@ def rollout(agent, envs, reward_scale, memory_noise):
 
 def gae(rewards, values, alive, gamma, gae_lambda):
     """A_t = sum_l (gamma lambda)^l delta_{t+l} and the returns A + V, all (T, N); V is 0 beyond an episode's end."""
+    device = rewards.device
+    rewards, values, alive = rewards.cpu(), values.cpu(), alive.cpu()  # a GPU would take longer: T small steps
     advantages = torch.zeros_like(rewards)
     lastgaelam = next_value = torch.zeros_like(values[0])
     for t in reversed(range(len(rewards))):
@@ -657,7 +668,7 @@ def gae(rewards, values, alive, gamma, gae_lambda):
         lastgaelam = (delta + gamma * gae_lambda * lastgaelam) * alive[t]
         advantages[t] = lastgaelam
         next_value = values[t] * alive[t]  # 0 beyond the episode's end
-    return advantages, advantages + values
+    return advantages.to(device), (advantages + values).to(device)
 
 
 def moments(x, alive, dim):
@@ -710,6 +721,16 @@ def ppo_loss(agent, batch, mb, clip_coef, vf_coef, ent_coef):
         losses["clipfrac"] = mean(((ratio - 1.0).abs() > clip_coef).to(ratio.dtype))
     of_all_processes = all_reduce_sum(torch.stack([value.detach() for value in losses.values()]))
     return loss, dict(zip(losses, of_all_processes))
+
+
+def ppo_gradient(args, agent, batch, mb, ent_coef):
+    """Set the parameters' `.grad` to the gradient of `ppo_loss`, clipped; returns what is logged, with its norm."""
+    loss, losses = ppo_loss(agent, batch, mb, args.clip_coef, args.vf_coef, ent_coef)
+    agent.zero_grad()
+    loss.backward()
+    runs.sum_gradients(agent)  # over torchrun's processes
+    losses["gradient_norm"] = nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
+    return losses
 
 
 # Shared, ours: what we add to PPO -------------------------------------------------------------------------------------
@@ -810,7 +831,7 @@ def minibatches(args, envs, device):
             yield epoch, minibatch, mb
 
 
-def train(args, agent, average, optimizer, envs, run):
+def train(args, agent, average, optimizer, envs, run, gradient=ppo_gradient):
     """Algorithm 1, its lines beside ours. `run` counts, logs, saves and evaluates; it changes nothing that is learned.
 
     Raises FloatingPointError, before the optimiser moves the weights, when a loss or the gradient is not finite.
@@ -843,20 +864,15 @@ def train(args, agent, average, optimizer, envs, run):
         # lines 15-18: epochs of minibatches
         log = []
         for epoch, minibatch, mb in minibatches(args, envs, advantages.device):  # lines 15 and 16
-            loss, losses = ppo_loss(agent, batch, mb, args.clip_coef, args.vf_coef, ent_coef)
-            runs.refuse_nan(losses, epoch, minibatch)
+            losses = gradient(args, agent, batch, mb, ent_coef)  # lines 17 and 18
+            losses = runs.finite(losses, epoch, minibatch)
             log.append(losses)
             if losses["approx_kl"] > target_kl:
                 break  # this minibatch takes no step, and ends the update
-            optimizer.zero_grad()  # line 18
-            loss.backward()
-            runs.sum_gradients(agent)  # over torchrun's processes
-            gradient_norm = nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
-            runs.refuse_nan({"gradient norm": gradient_norm}, epoch, minibatch)
-            optimizer.step()
+            optimizer.step()  # line 18
             average.update_parameters(agent)  # ours: what evaluation flies
 
-        means = {name: torch.stack([logged[name] for logged in log]).mean().item() for name in losses}
+        means = {name: torch.tensor([logged[name] for logged in log]).mean().item() for name in losses}
         means["explained_variance"] = explained_variance(batch.critic, batch.targets, batch.alive)
         means["baseline_explained_variance"] = explained_variance(baseline, returns, batch.alive)
 
@@ -883,11 +899,10 @@ def main(argv):
         env_options=env_options,
         describe=describe,
     )
-    if args.torch_compile:
-        agent.encode, agent.encode_step = torch.compile(agent.encode), torch.compile(agent.encode_step)
+    gradient = speed_up(agent, average, optimizer, ppo_gradient) if args.torch_compile else ppo_gradient
     if not args.eval_only:
         with run:  # whatever ends the training leaves its state after the last whole update
-            train(args, agent, average, optimizer, envs, run)
+            train(args, agent, average, optimizer, envs, run, gradient)
     run.finish()
 
 

@@ -420,11 +420,13 @@ def load_checkpoint(agent, args, saved):
         print(f"begins with {args.checkpoint}, sha256 {hashlib.sha256(Path(args.checkpoint).read_bytes()).hexdigest()}")
 
 
-def refuse_nan(values, epoch, minibatch):
-    """FloatingPointError that names the first of these logged tensors that is not finite, and where it was."""
-    for name, value in values.items():
-        if not value.isfinite():
-            raise FloatingPointError(f"{name} is {value} in epoch {epoch}, minibatch {minibatch}")
+def finite(values, epoch, minibatch):
+    """These logged tensors as numbers, in one copy from a GPU. FloatingPointError that names one that is not finite."""
+    numbers = dict(zip(values, torch.stack(list(values.values())).tolist()))
+    for name, number in numbers.items():
+        if not math.isfinite(number):
+            raise FloatingPointError(f"{name} is {number} in epoch {epoch}, minibatch {minibatch}")
+    return numbers
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -94,7 +94,7 @@ def loads(room, seen=None):
     return found
 
 
-LIGHT = {room for room in ROOMS if room.split(".")[0] not in {"drawing", "runs", "sb3_env"}}
+LIGHT = {room for room in ROOMS if room.split(".")[0] not in {"drawing", "runs", "cuda_graphs", "sb3_env"}}
 LIGHT -= {room for room in ROOMS if room.startswith("ppo_gtrxl") or room.endswith((".figures", ".animation"))}
 
 

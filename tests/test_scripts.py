@@ -238,7 +238,7 @@ def test_a_training_cut_short_is_evaluated_briefly():
 
 CHARTS = {f"charts/{name}" for name in ("episodic_return", "episodic_length", "learning_rate", "SPS")}
 LOSSES = "value_loss policy_loss entropy old_approx_kl approx_kl clipfrac explained_variance total_loss"
-LOSSES += " baseline_explained_variance"
+LOSSES += " baseline_explained_variance gradient_norm"
 CLOCKS = {"training_seconds", "wall_seconds"}
 RUN_FILES = {"args.json", "training_state.pt", "agent.safetensors", "eval.json", "eval.npz"}
 COMMON_KEYS = "env_id seed eval_seed eval_starts checkpoint_sha256 total_updates global_step wall_seconds device"
