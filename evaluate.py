@@ -1,6 +1,7 @@
 """A policy against the optimum: `evaluate`, and the results folders. Needs no torch, imports no script.
 
     python evaluate.py publish RUN_DIR results/di     # add a run to a results folder (--ship: make it the shipped one)
+    python evaluate.py shorten RUN_DIR                # half the bytes: RUN_DIR/bfloat16 can be published instead
     python evaluate.py figures results/di             # redraw its figures and print its table (a run folder works too)
     python evaluate.py animate results/di             # and its figures/animation.gif
     python evaluate.py opponents results/rocket_cutoff     # classical guidance on its policy's dispersed flights
@@ -11,6 +12,7 @@ results folders, command line.
 
 from __future__ import annotations
 
+import subprocess
 import sys
 import tempfile
 from pathlib import Path
@@ -18,8 +20,9 @@ from pathlib import Path
 import numpy as np
 
 import baselines  # noqa: F401 - makes every id known to `task_of`
+from common.checkpoints import read_checkpoint, write_bfloat16
 from common.command_line import OneLineParser, integer, named_path, positive
-from common.curves import read_csv, read_curve, write_csv
+from common.curves import evaluated, read_csv, read_curve, write_csv
 from common.evaluations import read_evaluation, read_json, read_metrics, sha256_of
 from common.files import read_npz, write_bytes, write_npz
 from common.tasks import task_of
@@ -44,9 +47,10 @@ def publish(run_dir, folder, ship: bool = False, numbers: bool = False):
     """Add a run to a results folder: its eval.json and training curve under seeds/, and the policy if it is shipped.
 
     The policy, its evaluation and the figures are replaced only where the folder ships none or with `ship`; with
-    `numbers` the folder holds seeds/ alone. It may keep a part of the flights; its figures are drawn of all. OSError or
-    ValueError says what is missing or does not fit; nothing has been written then. All is drawn before, and
-    seeds/<seed>.json is written last: where it is, the rest is, too.
+    `numbers` the folder holds seeds/ alone, and of a curve only the updates that were evaluated. The folder may keep a
+    part of the flights; its figures are drawn of all. OSError or ValueError says what is missing or does not fit;
+    nothing has been written then. All is drawn before, and seeds/<seed>.json is written last: where it is, the rest is,
+    too.
     """
     run_dir, folder = Path(run_dir), Path(folder)
     metrics, _ = read_evaluation(run_dir)
@@ -67,7 +71,7 @@ def publish(run_dir, folder, ship: bool = False, numbers: bool = False):
         (staged / "seeds").mkdir()
         for path in (folder / "seeds").glob("*.csv"):
             write_bytes(staged / "seeds" / path.name, path.read_bytes())
-        write_csv(staged / "seeds" / f"{seed}.csv", curve)
+        write_csv(staged / "seeds" / f"{seed}.csv", evaluated(curve) if numbers else curve)
         last = staged / "seeds" / f"{seed}.json"
         write_bytes(last, (run_dir / "eval.json").read_bytes())
         if ships:
@@ -77,6 +81,29 @@ def publish(run_dir, folder, ship: bool = False, numbers: bool = False):
             animate(staged)
             keep_excerpt(staged / "eval.npz", task_of(metrics["env_id"]))
         move(staged, folder, last, replaced=of_another_policy(folder) if ships else ())
+
+
+def shorten(run_dir) -> Path:
+    """Make RUN_DIR/bfloat16, a run folder whose policy has its large weights in bfloat16 and is flown anew.
+
+    OSError or BadInput says what is missing, ValueError what its script says when it cannot fly the policy.
+    """
+    run_dir, shorter = Path(run_dir), Path(run_dir) / "bfloat16"
+    policy = shorter / "agent.safetensors"
+    args = read_checkpoint(run_dir / "agent.safetensors", {"exp_name": str}, flag="")["args"]
+    shorter.mkdir(exist_ok=True)
+    for path in run_dir.glob("events.out.tfevents.*"):
+        write_bytes(shorter / path.name, path.read_bytes())
+    write_bfloat16(run_dir / "agent.safetensors", policy)
+    script = Path(__file__).with_name(f"{args['exp_name']}.py")
+    flags = {"checkpoint": policy, "eval-json": shorter / "eval.json", "eval-npz": shorter / "eval.npz"}
+    if "dispersion" in args:
+        flags["dispersion"] = args["dispersion"]
+    command = [sys.executable, script, "--eval-only", "--no-cuda", *(f"--{name}={flags[name]}" for name in flags)]
+    flown = subprocess.run(command, stderr=subprocess.PIPE, text=True)
+    if flown.returncode:
+        raise ValueError(f"{policy}: {flown.stderr.strip()}")
+    return shorter
 
 
 def keep_excerpt(path, task):
@@ -166,6 +193,10 @@ def publish_command(args):
     print_tables(args.folder)
 
 
+def shorten_command(args):
+    print(shorten(args.run_dir))
+
+
 def figures_command(args):
     for path in redraw(args.folder):
         print(path)
@@ -196,6 +227,7 @@ def print_tables(folder: Path):
 
 COMMANDS = {
     "publish": publish_command,
+    "shorten": shorten_command,
     "figures": figures_command,
     "animate": animate_command,
     "opponents": opponents_command,
@@ -203,13 +235,15 @@ COMMANDS = {
 
 
 def parse_args(argv=None):
-    """`publish RUN_DIR FOLDER [--ship]`, `figures FOLDER`, `animate FOLDER`, `opponents FOLDER [...]`."""
+    """A sub-command and what it takes."""
     parser = OneLineParser(description="Results folders: add a run, redraw figures, print the table.")
     commands = parser.add_subparsers(dest="command", required=True)
     command = commands.add_parser("publish", help="add a run to a results folder")
     command.add_argument("run_dir", type=Path, help="a finished run: runs/...")
     command.add_argument("folder", type=Path, help="results/<name>, made if it does not exist")
     command.add_argument("--ship", action="store_true", help="replace the policy that the folder ships")
+    command = commands.add_parser("shorten", help="write a run's policy in bfloat16 into RUN_DIR/bfloat16, and fly it")
+    command.add_argument("run_dir", type=Path, help="a run: runs/...")
     command = commands.add_parser("figures", help="redraw the figures of a results or run folder, print its table")
     command.add_argument("folder", type=Path, help="results/<name> or runs/...")
     command = commands.add_parser("animate", help="write figures/animation.gif of a results or run folder")

@@ -129,12 +129,6 @@ EXPERIMENTS = {
         rocket_rows("rocket_dispersed"),
         DISPERSED,
     ),
-    "rocket_before": Experiment(
-        "The same by 431bf3e to f6892e8, which saw less of what a flight differs by",
-        {**lengths(8, 32, 128), "true_mass": "L_mem 32, true mass seen"},
-        DISPERSED,
-        drawn=False,
-    ),
 }
 
 

@@ -1,4 +1,8 @@
-"""Reading an agent.safetensors, without torch. `runs.save_run` writes it: the averaged weights, last saved."""
+"""An agent.safetensors, read and made shorter without torch.
+
+`runs.save_run` writes it: the averaged weights, last saved. A large network may be kept in bfloat16, which is a float32
+without its lower 16 bits: half the bytes, three digits.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +11,13 @@ import math
 from pathlib import Path
 
 import numpy as np
-import safetensors.numpy
+import safetensors
 
 from common.errors import BadInput
+from common.files import write_bytes
 
+KINDS = {"F64": np.float64, "F32": np.float32, "F16": np.float16, "BF16": np.uint16, "I64": np.int64}
+LARGE = 10_000  # numbers of a tensor from which it is made shorter
 COUNTERS = {"seed": int, "total_updates": int, "global_step": int, "training_seconds": float, "wall_seconds": float}
 
 
@@ -25,8 +32,8 @@ def read_checkpoint(
     """
     try:
         data = Path(path).read_bytes()
-        tensors = safetensors.numpy.load(data)
-        metadata = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])["__metadata__"]
+        tensors = read_tensors(data)
+        metadata = read_metadata(data)
         args = {**(defaults or {}), **json.loads(metadata["args"])}
         env_id = args["env_id"]
         if env_ids and isinstance(env_id, str) and env_id not in env_ids:  # another script's has other arguments, too
@@ -48,3 +55,43 @@ def read_checkpoint(
     if not all(np.isfinite(tensor).all() for tensor in tensors.values()):
         raise BadInput(f"{flag}{path}: holds a NaN or an infinity; its weights must be finite")
     return {"args": args, "progress": progress, "tensors": tensors}
+
+
+def read_metadata(data: bytes) -> dict[str, str]:
+    """The metadata of a safetensors file. KeyError where it has none."""
+    header = data[8 : 8 + int.from_bytes(data[:8], "little")]
+    return json.loads(header)["__metadata__"]
+
+
+def read_tensors(data: bytes) -> dict[str, np.ndarray]:
+    """The arrays of a safetensors file by name. NumPy has no bfloat16: such an array is returned as float32.
+
+    KeyError for another kind of number than KINDS.
+    """
+    tensors = {}
+    for name, tensor in safetensors.deserialize(data):
+        array = np.frombuffer(tensor["data"], dtype=KINDS[tensor["dtype"]]).reshape(tensor["shape"])
+        if tensor["dtype"] == "BF16":
+            array = (array.astype(np.uint32) << 16).view(np.float32)
+        tensors[name] = array
+    return tensors
+
+
+def write_bfloat16(source, target):
+    """Write an agent.safetensors anew with its LARGE tensors rounded to bfloat16.
+
+    Small ones stay as they are: rounding the problem's constants (units, axes) would cost more than all weights.
+    """
+    data = Path(source).read_bytes()
+    specs, arrays = {}, []
+    for name, array in read_tensors(data).items():
+        kind = array.dtype.name
+        if array.dtype == np.float32 and array.size >= LARGE:
+            kind = "bfloat16"
+            bits = array.view(np.uint32)
+            array = ((bits + 0x7FFF + ((bits >> 16) & 1)) >> 16).astype(np.uint16)  # to the nearest, ties to even
+        arrays.append(array)  # `serialize` reads their memory
+        specs[name] = safetensors.TensorSpec(
+            dtype=kind, shape=array.shape, data_ptr=array.ctypes.data, data_len=array.nbytes
+        )
+    write_bytes(target, bytes(safetensors.serialize(specs, metadata=read_metadata(data))))

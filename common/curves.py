@@ -35,6 +35,15 @@ def write_csv(path, curve: dict):
             writer.writerow([step, *cells])
 
 
+def evaluated(curve: dict) -> dict:
+    """The part of a curve at the steps of its evaluations; the whole one where there are none."""
+    kept = np.unique(np.concatenate([np.empty(0), *(steps for tag, (steps, _) in curve.items() if tag[:5] == "eval/")]))
+    if not len(kept):
+        return curve
+    rows = {tag: np.isin(steps, kept) for tag, (steps, _) in curve.items()}
+    return {tag: (steps[rows[tag]], values[rows[tag]]) for tag, (steps, values) in curve.items()}
+
+
 def read_csv(path) -> dict:
     """The curve that `write_csv` wrote; ValueError if the file is not such a table."""
     with open(path, newline="") as file:

@@ -11,7 +11,6 @@ import ppo_gtrxl_rocket
 
 torch.set_num_threads(1)
 TINY = {"embed_dim": 8, "num_heads": 2, "mlp_dim": 12, "hidden_dim": 10, "num_blocks": 2, "update_epochs": 2}
-SCRIPTS = pytest.mark.parametrize("script", [ppo_gtrxl_di, ppo_gtrxl_rocket], ids=["di", "rocket"])
 
 
 class Graph:
@@ -57,8 +56,9 @@ def new_agent(script, dtype=torch.float32, **changes):
     return args, script.Agent(args, envs).to(dtype), envs
 
 
-@SCRIPTS
-@pytest.mark.parametrize("L", [0, 1, 7, 300])
+@pytest.mark.parametrize(
+    "script, L", [(ppo_gtrxl_di, 0), (ppo_gtrxl_di, 1), (ppo_gtrxl_di, 7), (ppo_gtrxl_di, 300), (ppo_gtrxl_rocket, 7)]
+)
 def test_the_same_flights(script, L, captured):
     """Two rollouts one after the other, shorter and longer than the memory: the plain ones to 1e-9."""
     _, plain, envs = new_agent(script, torch.float64, memory_length=L)
@@ -105,10 +105,17 @@ def learn(script, speed_up=None, num_envs=4, **changes):
     return dict(average.named_parameters()), counter.losses
 
 
-@SCRIPTS
-@pytest.mark.parametrize("changes", [{}, {"target_kl": 1e-4}, {"num_minibatches": 3}], ids=["", "KL limit", "uneven"])
+@pytest.mark.parametrize(
+    "script, changes",
+    [
+        (ppo_gtrxl_di, {}),
+        (ppo_gtrxl_di, {"target_kl": 1e-4}),
+        (ppo_gtrxl_di, {"num_minibatches": 3}),
+        (ppo_gtrxl_rocket, {"target_kl": 1e-4, "num_minibatches": 3}),
+    ],
+)
 def test_the_same_learning(script, changes, captured):
-    """Minibatches of 4 episodes of several sizes, with a KL limit that ends updates: the same weights and losses."""
+    """With a KL limit that ends updates, and minibatches of two sizes: the same weights and losses."""
     changes = {"num_minibatches": 2, "log_std": "0:-1 1:-3", **changes}
     weights, losses = learn(script, captured, **changes)
     expected, expected_losses = learn(script, **changes)

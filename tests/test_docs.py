@@ -217,7 +217,7 @@ def test_the_front_page_s_problem_is_solved(new_problem):
 def test_noise_wastes_the_speed_that_the_page_says(monkeypatch, capsys):
     """Its code as printed: action noise slows the 961 s policy by half a km/s, noise in the memory does nothing."""
     monkeypatch.chdir(ROOT)  # it names a policy of results/
-    page = (ROOT / "results" / "rocket_paper" / "README.md").read_text()
+    page = (ROOT / "results" / "table_1" / "rocket" / "README.md").read_text()
     (code,) = re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL)
     exec(code, {})
     calm, memory, action, both = ([float(x) for x in line.split()] for line in capsys.readouterr().out.splitlines())

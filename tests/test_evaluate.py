@@ -16,7 +16,7 @@ import baselines
 import envs
 import evaluate
 from common import files
-from common.curves import read_csv, read_curve, write_csv
+from common.curves import evaluated, read_csv, read_curve, write_csv
 from common.files import write_json, write_npz
 from drawing import animation
 from drawing.training import median_curve
@@ -423,6 +423,9 @@ def test_curve_of_a_resumed_run_keeps_the_last_value(tmp_path):
     for tag, (steps, values) in curve.items():
         assert np.array_equal(again[tag][0], steps)
         assert np.array_equal(again[tag][1].astype(np.float32), values.astype(np.float32))  # bit for bit
+    short = evaluated(curve)
+    assert short["losses/policy_loss"][0].tolist() == [300, 400] == short["eval/ratio_mean"][0].tolist()
+    assert short["losses/policy_loss"][1].tolist() == curve["losses/policy_loss"][1][2:].tolist()
     for text in ("step,loss\n1,2\n", "global_step,loss\n1\n", ""):
         path.write_text(text)
         with pytest.raises(ValueError, match="not a training curve"):

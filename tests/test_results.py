@@ -39,9 +39,11 @@ def test_a_result_is_whole(folder):
 @pytest.mark.slow
 @pytest.mark.parametrize("folder", SHIPPED, ids=lambda folder: folder.name)
 def test_a_policy_was_trained_by_the_command_that_its_list_gives(folder, monkeypatch):
-    """All arguments, those that the recipe sets, too. The command is an id and a seed."""
+    """All arguments, those that the recipe sets, too. The command is an id and a seed, but for the GPU's."""
     monkeypatch.chdir(ROOT)  # a command names a policy of results/
-    (job, *_) = [job for job in run_seeds.read_jobs("benchmarks/result_jobs.txt") if job.results.name == folder.name]
+    on_gpu = folder.name == "rocket_paper"
+    jobs = run_seeds.read_jobs("benchmarks/gpu_jobs.txt" if on_gpu else "benchmarks/result_jobs.txt")
+    (job, *_) = [job for job in jobs if job.results.name == folder.name]
     with safetensors.safe_open(folder / "agent.safetensors", "pt") as file:
         args = json.loads(file.metadata()["args"])
     if "recipe" not in args:
@@ -51,12 +53,12 @@ def test_a_policy_was_trained_by_the_command_that_its_list_gives(folder, monkeyp
     if isinstance(args["log_std"], str):
         without_effect.add("ent_coef")  # an entropy that is set has no gradient
     assert differ <= without_effect
-    assert set(job.command[1::2]) <= {"--env-id", "--dispersion", "--seed"}
+    assert on_gpu or set(job.command[1::2]) <= {"--env-id", "--dispersion", "--seed"}
 
 
 def test_table_1_s_rocket_is_the_last_evaluation_of_its_curve():
     """And its table is that of all evaluations, with the sampled flights' median as it was printed then."""
-    folder = RESULTS / "rocket_paper"
+    folder = RESULTS / "table_1" / "rocket"
     metrics, curve = json.loads((folder / "seeds/1.json").read_text()), curves.read_csv(folder / "seeds/1.csv")
     for key in set(metrics) - {"env_id", "device", "torch_version"}:  # a curve holds no words
         assert curve[f"eval/{key}"][1][-1] == pytest.approx(float(metrics[key]), rel=1e-7), key
@@ -73,5 +75,5 @@ def test_table_1_s_rocket_is_the_last_evaluation_of_its_curve():
     assert [line for line in page if re.match(r"\| \d", line)] == expected
 
 
-def test_results_are_below_25_megabytes():
-    assert sum(path.stat().st_size for path in RESULTS.rglob("*") if path.is_file()) < 25e6
+def test_results_are_below_40_megabytes():
+    assert sum(path.stat().st_size for path in RESULTS.rglob("*") if path.is_file()) < 40e6

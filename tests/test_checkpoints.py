@@ -1,0 +1,58 @@
+"""agent.safetensors in bfloat16, against torch's own rounding."""
+
+import hashlib
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import safetensors.torch
+import torch
+
+import evaluate
+from common.checkpoints import LARGE, read_checkpoint, write_bfloat16
+
+ROOT = Path(__file__).parent.parent
+
+
+def test_large_weights_become_bfloat16(tmp_path):
+    """Every kind of float32: the file's bits are torch's, small tensors and metadata stay."""
+    torch.manual_seed(0)
+    bits = torch.randint(-(2**31), 2**31 - 1, (300, 500), dtype=torch.int64).to(torch.int32)
+    large = bits.view(torch.float32)
+    large[~large.isfinite() | (large.abs() > 1e38)] = 1.0
+    large[0, :4] = torch.tensor([0.0, -0.0, 1.00390625, 1.01171875])  # the last two lie between two bfloat16
+    tensors = {"large": large, "small": torch.randn(LARGE - 1), "rows": torch.arange(4)}
+    counters = {"seed": 3, "total_updates": 4, "global_step": 5, "training_seconds": 6.0, "wall_seconds": 7.0}
+    metadata = {"args": json.dumps({"env_id": "X-v0"}), **{name: str(value) for name, value in counters.items()}}
+    source, target = tmp_path / "agent.safetensors", tmp_path / "short.safetensors"
+    safetensors.torch.save_file(tensors, source, metadata)
+
+    write_bfloat16(source, target)
+    written = safetensors.torch.load_file(target)
+    assert torch.equal(written["large"].view(torch.int16), large.to(torch.bfloat16).view(torch.int16))
+    assert torch.equal(written["small"], tensors["small"]) and torch.equal(written["rows"], tensors["rows"])
+
+    found = read_checkpoint(target, {})
+    assert found["args"] == {"env_id": "X-v0"} and found["progress"] == counters
+    assert found["tensors"]["large"].dtype == np.float32
+    np.testing.assert_array_equal(found["tensors"]["large"], large.to(torch.bfloat16).float().numpy())
+    np.testing.assert_array_equal(found["tensors"]["small"], tensors["small"].numpy())
+    assert target.stat().st_size < source.stat().st_size * 0.6
+
+
+@pytest.mark.slow
+def test_a_shorter_policy_is_flown_anew(tmp_path, monkeypatch):
+    """With every tensor rounded the rocket still arrives, a little off; its run folder is left alone."""
+    run = tmp_path / "run"
+    run.mkdir()
+    shutil.copy(ROOT / "results" / "rocket_cutoff" / "agent.safetensors", run)
+    monkeypatch.setattr("common.checkpoints.LARGE", 2000)
+    shorter = evaluate.shorten(run)
+    metrics = json.loads((shorter / "eval.json").read_text())
+    sha256 = hashlib.sha256((shorter / "agent.safetensors").read_bytes()).hexdigest()
+    assert metrics["checkpoint_sha256"] == sha256
+    assert 1e-6 < metrics["error_norm"] < 0.01 and metrics["success"]
+    assert (shorter / "eval.npz").exists()
+    assert {path.name for path in run.iterdir()} == {"agent.safetensors", "bfloat16"}
