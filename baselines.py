@@ -29,11 +29,11 @@ from multiprocessing import get_context
 
 import numpy as np
 
-from common.command_line import OneLineParser, output_file
+from common.command_line import OneLineParser, integer, output_file
 from common.errors import BadInput, NoOptimum
 from common.files import replacing, write_npz
 from common.integration import rk4
-from common.ipopt import interruptible
+from common.ipopt import interruptible, limit
 from common.tasks import add_family, env_ids, task_of
 from envs import DOUBLE_INTEGRATOR, PROBLEMS, Problem, fly
 from phased.problem import starts
@@ -205,6 +205,7 @@ def solver(env_id: str, defect: Callable, in_circles: bool):
         "ipopt.sb": "yes",
         "ipopt.tol": 1e-10,
         "ipopt.bound_relax_factor": 0,  # the default lets solutions end 2.5e-7 outside their circle
+        "ipopt.max_wall_time": limit["seconds"],
     }
     T, circles = problem.steps, len(problem.phases) if in_circles else 0
     u_bound, x_free, dynamics = np.full(T, problem.u_max), np.full(2 * T, np.inf), np.zeros(2 * T)
@@ -514,12 +515,17 @@ def parse_args(argv=None):
     for command in set(commands.choices.values()):  # a problem with two names is there twice
         command.add_argument("--json", type=output_file, metavar="F", help="write the numbers to this file")
         command.add_argument("--npz", type=output_file, metavar="F", help="write the trajectories to this file")
+        at_most = f"after which a solve is given up, all its tries together: default {limit['seconds']:g}"
+        command.add_argument(
+            "--solve-seconds", type=integer(1, 86400), default=limit["seconds"], metavar="S", help=at_most
+        )
     return parser.parse_args(argv)
 
 
 def main() -> None:
     """Run the sub-command; what can go wrong in it ends in one line."""
     args = parse_args()
+    limit["seconds"] = args.solve_seconds
     try:
         save(args, *args.solve(args))
     except (ImportError, OSError, RuntimeError) as error:

@@ -317,7 +317,8 @@ def nominal_at(agent, phase, energy):
 
     `nominal_flight` has one row for each step. Between two rows of a burn the values are linear in the energy; beyond
     a burn's first or last row the nearest two rows are extrapolated. Energies are between -1 and 0 and rise within a
-    burn, so burn + energy rises over the whole flight: one sorted key finds the row.
+    burn, so burn + energy rises over the whole flight: one sorted key finds the row. In a coast the energy stays, and
+    so does the orbit: there the coast's first row is taken.
     """
     rows = agent.nominal_flight
     burn = (phase * (len(agent.phases) - 1)).round().contiguous()
@@ -326,8 +327,11 @@ def nominal_at(agent, phase, energy):
     first_of_burn = torch.searchsorted(burns, burn)
     last_of_burn = torch.searchsorted(burns, burn, right=True) - 1
     after = torch.searchsorted(burns + energies, key)  # the first row whose key is not smaller
+    coasts = energies[last_of_burn] - energies[first_of_burn.clamp(max=len(rows) - 1)] < 1e-6
+    after = torch.where(coasts, first_of_burn + 1, after)
     after = torch.minimum(torch.maximum(after, first_of_burn + 1), last_of_burn).clamp(min=1)[..., 0]
     share = (energy - rows[after - 1, 1:2]) / (rows[after, 1:2] - rows[after - 1, 1:2]).clamp(min=1e-7)
+    share = torch.where(coasts, 0.0, share)
     return torch.lerp(rows[after - 1, 2:], rows[after, 2:], share)
 
 

@@ -1,10 +1,73 @@
-"""IPOPT in CasADi, and Ctrl-C while it runs."""
+"""IPOPT in CasADi: Ctrl-C while it runs, a limit in seconds, and a line where it takes long."""
 
 from __future__ import annotations
 
 import signal
+import sys
 import threading
+import time
 from contextlib import contextmanager
+
+PATIENCE = 5.0  # s without a line
+limit = {"seconds": 120}  # of all tries of one solve; `python baselines.py ID --solve-seconds` sets it
+
+
+class SolveClock:
+    """The seconds that the tries of one solve have taken together; after `PATIENCE` one line says that it goes on."""
+
+    def __init__(self, what: str):
+        self.what = what
+        self.began = time.monotonic()
+        self.has_spoken = False
+
+    def seconds(self) -> float:
+        return time.monotonic() - self.began
+
+    def seconds_left(self) -> float:
+        """Until the limit; 0 beyond it."""
+        return max(limit["seconds"] - self.seconds(), 0.0)
+
+    def speak(self):
+        """The line, once, on stderr."""
+        if not self.has_spoken and self.seconds() > PATIENCE:
+            self.has_spoken = True
+            print(f"{self.what}: IPOPT is looking for it, at most {limit['seconds']:g} s", file=sys.stderr, flush=True)
+
+    def callback(self, program: dict):
+        """For `nlpsol`: called after each of IPOPT's iterations."""
+        import casadi as ca
+
+        clock = self
+
+        class AfterIteration(ca.Callback):
+            def __init__(self):
+                ca.Callback.__init__(self)
+                self.sizes = {"x": program["x"].numel(), "g": program["g"].numel()}
+                self.construct("after_iteration", {})
+
+            def get_n_in(self):
+                return ca.nlpsol_n_out()
+
+            def get_n_out(self):
+                return 1
+
+            def get_name_in(self, k):
+                return ca.nlpsol_out(k)
+
+            def get_name_out(self, k):
+                return "stop"
+
+            def get_sparsity_in(self, k):
+                size = {"f": 1, "x": self.sizes["x"], "lam_x": self.sizes["x"]}
+                size |= {"g": self.sizes["g"], "lam_g": self.sizes["g"]}
+                return ca.Sparsity.dense(size.get(ca.nlpsol_out(k), 0), 1)
+
+            def eval(self, arguments):
+                clock.speak()
+                return [0]
+
+        self.kept = AfterIteration()  # CasADi holds no reference of its own
+        return self.kept
 
 
 @contextmanager

@@ -152,8 +152,8 @@ def draw_vehicles(rocket: Rocket, dispersion: float, draw: np.ndarray) -> Vehicl
         dry_mass=factors.payload + empty(last),
         propellant=none + loaded(last),
         end=np.vstack([end, none + np.inf]),
-        thrust=np.array([*(thrust(burn) for burn in rocket.burns), none]),
-        flow=np.array([*(flow(burn) for burn in rocket.burns), none]),
+        thrust=np.array([*(none + thrust(burn) for burn in rocket.burns), none]),
+        flow=np.array([*(none + flow(burn) for burn in rocket.burns), none]),
         dropped=np.vstack([dropped, none]),
         burn_out=burn_out,
         wind=factors.wind,
@@ -165,8 +165,8 @@ def burn_ends(rocket: Rocket, lasting: np.ndarray):
     """Ends of the burns (B, N) s, the last one's when it runs dry; `burn_out` (N,) s; seconds lit of the groups (G, N).
 
     lasting (types, N): how long an engine's propellant lasts, as a part of the nominal time. A burn that drops burning
-    engines ends when the first of them has burnt as large a part of its propellant as nominally, any other at its
-    nominal time, and none goes on without an engine's propellant.
+    engines ends when the first of them has burnt as large a part of its propellant as nominally, a coast
+    after its nominal length, any other at its nominal time, and none goes on without an engine's propellant.
     """
     groups, last = engine_groups(rocket), len(rocket.burns) - 1
     start = burn_out = np.zeros(lasting.shape[1])
@@ -174,7 +174,8 @@ def burn_ends(rocket: Rocket, lasting: np.ndarray):
     ends = []
     for k, burn in enumerate(rocket.burns):
         until_empty, until_due = seconds_left(groups, k, lasting, seconds_lit)
-        until_due = np.where(np.isfinite(until_due), until_due, burn.end - start)
+        planned = burn.end - (rocket.burns[k - 1].end if burn.is_coast else start)  # a coast keeps its length
+        until_due = np.where(np.isfinite(until_due), until_due, planned)
         burn_out = start + np.maximum(np.minimum(until_due, until_empty), 0.0)
         end = start + np.maximum(until_empty, 0.0) if k == last else burn_out
         for group, seconds in zip(groups, seconds_lit):
@@ -218,6 +219,9 @@ def wind_velocity(place, wind, rocket: Rocket = ROCKET):
     return -east * ry - south * rx, east * rx - south * ry, north * axis
 
 
+NAMES = "; engines of equal numbers that are lit at other times need a `name` of their own"
+
+
 def check_drawable(rocket: Rocket):
     """BadInput where no flights can be drawn of a rocket: with all scores 0 it has to be the nominal one.
 
@@ -228,8 +232,8 @@ def check_drawable(rocket: Rocket):
     for k, (burn, dropped) in enumerate(zip(rocket.burns, rocket.jettison)):
         ends, leaves = drawn.end[k, 0], drawn.dropped[k, 0]
         same = np.isclose(burn.end, ends) or (k == last and (ends > burn.end or rocket.table_isp))
-        allowed = f"cannot be drawn: its engines, each from its own tank, burn until {ends:.6g} s"
+        allowed = f"cannot be drawn: its engines, each from its own tank, burn until {ends:.6g} s{NAMES}"
         refuse_unless(same, f"burns[{k}].end", burn.end, allowed)
         same = np.isclose(dropped, leaves) or rocket.table_isp  # a drawn flight drops what has not burnt
-        allowed = f"cannot be drawn: with what has not burnt then it is {leaves:.6g} kg"
+        allowed = f"cannot be drawn: with what has not burnt then it is {leaves:.6g} kg{NAMES}"
         refuse_unless(same, f"what burns[{k}] drops", f"{dropped:.6g} kg", allowed)

@@ -134,6 +134,7 @@ class RocketVectorEnv(BatchedEnv):
             check_drawable(self.mission.rocket)
         self.rocket, self.cutoff = self.mission.rocket, mission.cutoff
         self._last_phase = len(self.rocket.burns) - 1
+        self._coasts = np.array([burn.is_coast for burn in self.rocket.burns])  # by phase
         self.action_frame, self.observe_phase = action_frame, observe_phase
         self.dispersion, self.observe_draw, self.observe_mass = dispersion, observe_draw, observe_mass
         self.mass_weight, self.trajectory_weight, self.guidance_weight, self.guidance = 0.0, 0.0, 0.1, False
@@ -150,6 +151,7 @@ class RocketVectorEnv(BatchedEnv):
         self._parts = np.zeros((len(self.PARTS), num_envs))
         self._distance, self._energy, self.time, self._max_altitude = np.zeros((4, num_envs))
         self._crashed = np.zeros(num_envs, dtype=bool)
+        self._coasted = np.zeros(num_envs, dtype=bool)  # in the step before
         self._everyone = np.arange(num_envs)
 
     def _build(self):
@@ -428,6 +430,10 @@ class RocketVectorEnv(BatchedEnv):
         t = self.t
         distance, energy = self._progress()
         turn = np.sqrt(((u - self.u) ** 2).sum(axis=0)) * (t > 0)
+        if self._coasts.any():  # a direction without thrust counts for nothing, nor does the turn away from it
+            coasts = self._coasts[phase]
+            turn = turn * ~(coasts | self._coasted)
+            self._coasted = coasts
         burnt = (before[6] - self.y[6]) * (phase == self._last_phase)
         parts = np.zeros_like(self._parts)
         parts[0] = orbital_reward(self._distance, distance)

@@ -20,17 +20,29 @@ from common.errors import is_finite, refuse_unless, refuse_unless_finite
 # ---------------------------------------------------------------------------------------------------------------------
 
 
+G0 = 9.80665  # m/s^2
+ISP_TOLERANCE = 0.02  # the paper's second stage, whose numbers contradict each other, differs by 0.0104
+
+
 @dataclass(frozen=True)
 class Engine:
-    """One row block of the table: a solid booster or a stage."""
+    """One row block of the table: a solid booster or a stage.
+
+    Thrust, propellant and burn_time are flown; they make the specific impulse `flown_isp`. The table's `isp` is flown
+    in the place of the burn time with `table_isp` alone. A warning says where the two differ by more than 2 %.
+
+    Two engines of equal numbers and names are one type: in dispersed flights they share their draws.
+    """
 
     total_mass: float  # kg
     propellant: float  # kg
     thrust: float  # N
-    isp: float  # s, the table's, flown with table_isp alone: the other four contradict it
+    isp: float  # s
     burn_time: float  # s
+    name: str = ""  # tells engines of equal numbers apart
 
     def __post_init__(self):
+        refuse_unless(isinstance(self.name, str), "an engine's name", repr(self.name), "must be a string")
         refuse_unless_finite("an engine's", self)
         for name in ("total_mass", "burn_time", "isp"):
             refuse_unless(getattr(self, name) > 0, f"an engine's {name}", getattr(self, name), "must be positive")
@@ -39,6 +51,15 @@ class Engine:
         refuse_unless(self.thrust >= 0, "an engine's thrust", self.thrust, "must not be negative")
         burns = self.propellant > 0 or self.thrust == 0
         refuse_unless(burns, "an engine's propellant", self.propellant, "must be positive where it has thrust")
+        if self.thrust and abs(self.flown_isp / self.isp - 1) > ISP_TOLERANCE:
+            flown = f"its thrust, propellant and burn_time make {self.flown_isp:.4g} s, and these three are flown"
+            consistent = f"a burn_time of {self.propellant * G0 * self.isp / self.thrust:.6g} s would agree with it"
+            warnings.warn(f"an engine's isp is {self.isp:g} s, but {flown}; {consistent}", stacklevel=3)
+
+    @property
+    def flown_isp(self) -> float:
+        """s: thrust / (g0 flow) of the propellant over the burn time; 0 without thrust."""
+        return self.thrust * self.burn_time / (G0 * self.propellant) if self.thrust else 0.0
 
     def flow(self, table_isp: bool) -> float:
         """Propellant flow in kg/s: propellant / burn time (the GPOPS-II benchmark's), or T / (g0 Isp) of the table."""
@@ -47,7 +68,10 @@ class Engine:
 
 @dataclass(frozen=True)
 class Burn:
-    """A phase: the engines that burn until `end` and those that are dropped then, as (number, engine)."""
+    """A phase: the engines that burn until `end` and those that are dropped then, as (number, engine).
+
+    `Burn(end, ())` is a coast: nothing burns, and the thrust direction counts for nothing.
+    """
 
     end: float  # s
     engines: tuple[tuple[int, Engine], ...]
@@ -62,6 +86,10 @@ class Burn:
             refuse_unless(pairs, f"a burn's {name}", f"{parts!r:.60}", allowed)
         number = isinstance(self.end, int | float | np.number)
         refuse_unless(number, "a burn's end", repr(self.end), "must be a number of seconds")
+
+    @property
+    def is_coast(self) -> bool:
+        return not self.engines
 
     @property
     def thrust(self) -> float:
@@ -83,7 +111,6 @@ class OrbitalElements(NamedTuple):
     argp: np.ndarray | float  # argument of perigee, rad, 0..2 pi; 0 on a circular orbit
 
 
-G0 = 9.80665  # m/s^2
 BOOSTER = Engine(total_mass=19290.0, propellant=17010.0, thrust=628500.0, isp=284.0, burn_time=75.2)
 STAGE_1 = Engine(total_mass=104380.0, propellant=95550.0, thrust=1083100.0, isp=301.7, burn_time=261.0)
 STAGE_2 = Engine(total_mass=19300.0, propellant=16820.0, thrust=110094.0, isp=462.4, burn_time=700.0)
@@ -318,14 +345,19 @@ def burns_of_group(rocket: Rocket, engine: Engine, k: int) -> tuple[int, ...]:
 
 def check_rocket(rocket: Rocket):
     """BadInput where a rocket cannot be; a warning where it can, at a price that is easily overlooked."""
+    for name in ("a", "e", "i", "raan", "argp"):
+        allowed = "must be a number: all five elements are given, a free one has to be chosen"
+        refuse_unless(getattr(rocket, name) is not None, f"a rocket's {name}", None, allowed)
     refuse_unless_finite("a rocket's", rocket)
     for name in ("mu", "Re", "H", "dt", "a", "end_time"):
         refuse_unless(getattr(rocket, name) > 0, f"a rocket's {name}", getattr(rocket, name), "must be positive")
     for name in ("payload", "rho0", "Cd", "S"):
         refuse_unless(getattr(rocket, name) >= 0, f"a rocket's {name}", getattr(rocket, name), "must not be negative")
-    allowed = f"must be above half of Re, {rocket.Re / 2:.6g} m: with less energy it lies on the ground"
-    refuse_unless(rocket.a > rocket.Re / 2, "a rocket's a", f"{rocket.a} m", allowed)
     refuse_unless(0 <= rocket.e < 1, "a rocket's e", rocket.e, "must be at least 0 and below 1, a closed orbit")
+    perigee, apogee = (rocket.a * (1 + sign * rocket.e) - rocket.Re for sign in (-1, 1))
+    orbit = f"{rocket.a} m with e {rocket.e}, {perigee / 1e3:.1f} km by {apogee / 1e3:.1f} km"
+    allowed = f"must have its perigee above the ground; a is counted from the centre, {rocket.Re / 1e3:.6g} km below it"
+    refuse_unless(perigee > 0, "a rocket's a", orbit, allowed)
     refuse_unless(0 <= rocket.i <= 180, "a rocket's i", rocket.i, "must be between 0 and 180 degrees")
     refuse_unless(-90 < rocket.latitude < 90, "a rocket's latitude", rocket.latitude, "must be between -90 and 90")
     check_burns(rocket)
@@ -354,7 +386,9 @@ def check_burns(rocket: Rocket):
         refuse_unless(
             start < burn.end < np.inf, f"burns[{k}].end", burn.end, f"must be finite and later than {start} s"
         )
-        refuse_unless(burn.engines, f"burns[{k}].engines", burn.engines, "must hold an engine")
+        may_coast = 0 < k < len(rocket.burns) - 1
+        allowed = "must hold an engine: only a burn between others may be a coast"
+        refuse_unless(burn.engines or may_coast, f"burns[{k}].engines", burn.engines, allowed)
         aboard = engines_aboard(rocket, k)
         for number, engine in burn.engines:
             field, has = f"the number of an engine in burns[{k}].engines", aboard.get(engine, 0)

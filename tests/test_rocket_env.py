@@ -32,7 +32,7 @@ from rocket_oracle import (
     unit,
 )
 
-from envs import ROCKETS, RocketVectorEnv, ascent_dynamics, fly_rocket, local_frame, rk4
+from envs import ROCKETS, Rocket, RocketVectorEnv, ascent_dynamics, fly_rocket, local_frame, rk4
 
 REGISTERED, IDS = [FIXED, CUTOFF, LEO], [FIXED, CUTOFF, LEO_FIXED, LEO]
 KEYS = {
@@ -366,10 +366,10 @@ def test_cutoff_of_many_flights_is_exact(v):
 
 
 @both
-def test_nothing_is_cut_before_the_last_phase(v):
+def test_nothing_is_cut_before_the_last_phase(v, monkeypatch):
     a, reached = (3.5e6, 100) if v is PAPER else (3.4e6, 80)  # its energy is reached long before: by this step
-    low = replace(ROCKETS[v.cutoff].rocket, a=a)
-    envs = [make(env_id, rocket=low, action_frame="local") for env_id in (v.cutoff, v.fixed)]
+    monkeypatch.setattr(Rocket, "target_energy", -MU / (2 * a))
+    envs = [make(env_id, action_frame="local") for env_id in (v.cutoff, v.fixed)]
     cut, whole = [fly(each, lambda obs, t: v.programme(2 * t)) for each in envs]
     assert energy(whole[0][reached]) > -MU / (2 * a), "reached before the last phase"
     assert v.last_ignition <= cut[2]["final_time_s"] < v.last_ignition + 3 and whole[2]["final_time_s"] == v.end
@@ -569,9 +569,10 @@ def test_tiny_end_time_is_one_step_or_refused(v, value):
 
 
 @pytest.mark.parametrize("v, end_time", [(PAPER, 100.0), (PAPER, 200.0), (TWO_STAGE, 160.0)])
-def test_short_flights_know_no_last_phase(v, end_time):
+def test_short_flights_know_no_last_phase(v, end_time, monkeypatch):
     """Neither the mass term nor the cut-off act before the last phase, where the training ends the episode before."""
-    envs = make(v.cutoff, action_frame="local", rocket=replace(ROCKETS[v.cutoff].rocket, a=3.3e6))
+    monkeypatch.setattr(Rocket, "target_energy", -MU / (2 * 3.3e6))
+    envs = make(v.cutoff, action_frame="local")
     envs.unwrapped.end_time, envs.unwrapped.mass_weight = end_time, 1.0
     *_, final = fly(envs, lambda obs, t: v.programme(2 * t))
     assert final["final_time_s"] == end_time
