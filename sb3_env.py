@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 import numpy as np
+from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env import VecEnv
 
 import envs
@@ -31,6 +32,9 @@ class NativeVecEnv(VecEnv):
 
     def __init__(self, batch: envs.BatchedEnv):
         self.batch = getattr(batch, "unwrapped", batch)
+        mode = self.batch.metadata["autoreset_mode"]
+        if mode is not AutoresetMode.SAME_STEP:
+            raise ValueError(f"the batch's autoreset_mode is {mode.value!r}; it must be 'SameStep', the default")
         super().__init__(batch.num_envs, batch.single_observation_space, batch.single_action_space)
 
     def reset(self):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import difflib
+import inspect
 from collections.abc import Callable
 
 import gymnasium as gym
@@ -11,13 +13,39 @@ from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from common.errors import BadInput
+from common.errors import BadInput, refuse_unless
 
 RENDERED = {"render_modes": ["rgb_array"], "render_fps": 15}
+AUTORESET_MODES = (AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP)
 
 
-class BatchedEnv(VectorEnv):
-    """What every problem shares: step counters, checks of the action, and autoreset in the same step.
+class Sealed:
+    """An environment that takes no attribute which it does not have: a misspelt one would do nothing, silently."""
+
+    _is_sealed = False
+
+    def sealed(self):
+        """This environment, from here on without new public attributes."""
+        self._is_sealed = True
+        return self
+
+    def __setattr__(self, name, value):
+        if self._is_sealed and not name.startswith("_") and not hasattr(self, name):
+            known = [other for other in dir(self) if not other.startswith("_")]
+            near = difflib.get_close_matches(name, known, n=1)
+            meant = f"; did you mean {near[0]!r}?" if near else ""
+            raise AttributeError(f"{type(self).__name__} has no attribute {name!r}{meant}")
+        super().__setattr__(name, value)
+
+
+class BatchedEnv(Sealed, VectorEnv):
+    """What every problem shares: step counters, checks of the action, and autoreset.
+
+    With `autoreset_mode` "SameStep", the default, an episode that ends is followed by the next one's first observation
+    in the same step; its own last values are `final_obs` and `final_info`. With "NextStep", as CleanRL and Gymnasium's
+    wrappers expect it, that step returns the episode's last observation and, in the info, its last values; the step
+    after it ignores that environment's action and returns the next episode's first observation, with reward 0.
+    https://farama.org/Vector-Autoreset-Mode
 
     A problem gives the spaces, `episode_steps` (the longest episode) and three methods:
     `_start(mask, options)` puts the environments in `mask` at a start, `_observe()` returns (N, obs) float64, and
@@ -53,9 +81,15 @@ class BatchedEnv(VectorEnv):
         single_observation_space: Box,
         single_action_space: Box,
         render_mode: str | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
     ):
         if num_envs < 1:
             raise ValueError(f"num_envs is {num_envs}; it must be at least 1")
+        if autoreset_mode not in [*AUTORESET_MODES, *(mode.value for mode in AUTORESET_MODES)]:
+            allowed = " or ".join(repr(mode.value) for mode in AUTORESET_MODES)
+            raise ValueError(f"autoreset_mode is {autoreset_mode!r}; it must be {allowed}")
+        self.metadata = {**self.metadata, "autoreset_mode": AutoresetMode(autoreset_mode)}
+        self._waiting = np.zeros(num_envs, dtype=bool)  # with NextStep: whose episode ended in the step before
         if render_mode not in (None, *self.metadata["render_modes"]):
             allowed = ", ".join(["None", *self.metadata["render_modes"]])
             raise ValueError(f"render_mode is {render_mode!r}; it must be one of {allowed}")
@@ -74,11 +108,14 @@ class BatchedEnv(VectorEnv):
         """Start every environment anew; returns (N, obs) float64 and an empty info."""
         super().reset(seed=seed)
         self._restart(np.ones(self.num_envs, dtype=bool), options)
+        self._waiting[:] = False
         self._was_reset = True
         return self._observe(), {}
 
     def step(self, actions):
-        """Fly one step and restart what ended; the ended episodes' last values are `final_obs` and `final_info`."""
+        """Fly one step and restart what ended, in this step or, with `autoreset_mode` "NextStep", in the next one."""
+        if self.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP:
+            return self._step_and_wait(actions)
         obs, rewards, terminated, final = self.advance(actions)
         info = {}
         if terminated.any():
@@ -88,6 +125,26 @@ class BatchedEnv(VectorEnv):
             self._restart(terminated, None)
             obs = self._observe()
         return obs, rewards, terminated, np.zeros(self.num_envs, dtype=bool), info
+
+    def _step_and_wait(self, actions):
+        """`step` with autoreset in the next step."""
+        begins = self._waiting.copy()
+        if begins.any():
+            self._restart(begins, None)  # they are flown along, and put back to a start behind that
+        obs, rewards, terminated, final = self.advance(actions)
+        if begins.any():
+            self._restart(begins, None)
+            obs = self._observe()
+            rewards = np.where(begins, 0.0, rewards)
+        terminated = terminated & ~begins
+        self._waiting = terminated
+        info = {}
+        if terminated.any():
+            info = {**final, **{f"_{key}": terminated.copy() for key in final}}
+        return obs, rewards, terminated.copy(), np.zeros(self.num_envs, dtype=bool), info
+
+    def __getstate__(self):
+        return {**self.__dict__, "_sheet": None}  # a drawing cannot be copied, and is made anew
 
     def advance(self, actions):
         """Fly one step without autoreset: `(obs, rewards, terminated, final_info)`.
@@ -158,7 +215,7 @@ def warn_of_no_mode(env):
     )
 
 
-class SingleEnv(gym.Env):
+class SingleEnv(Sealed, gym.Env):
     """One environment: a thin view of a batch of one (`batch`), without its autoreset.
 
     A step without a reset before it, also the one after an episode's end, raises `gymnasium.error.ResetNeeded`.
@@ -202,3 +259,12 @@ class SingleEnv(gym.Env):
 def of_batch(name: str, doc: str) -> property:
     """A property of a single environment that is its batch's."""
     return property(lambda env: getattr(env.batch, name), lambda env, value: setattr(env.batch, name, value), doc=doc)
+
+
+def check_options(environment: type, options: dict):
+    """BadInput for an option that an environment's constructor does not take."""
+    allowed = [
+        name for name in inspect.signature(environment).parameters if name not in ("num_envs", "problem", "mission")
+    ]
+    for name, value in options.items():
+        refuse_unless(name in allowed, f"the option {name}", repr(value), f"must be one of {', '.join(allowed)}")

@@ -8,8 +8,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium.spaces import Box
+from gymnasium.vector import AutoresetMode
 
-from common.batch import RENDERED, BatchedEnv, SingleEnv, of_batch
+from common.batch import RENDERED, BatchedEnv, SingleEnv, check_options, of_batch
 from common.errors import BadInput
 from common.integration import rk4
 from phased.problem import PROBLEMS, Problem
@@ -50,6 +51,7 @@ class PhasedVectorEnv(BatchedEnv):
         observe_phase: bool = True,
         observe_velocity: bool = True,
         render_mode: str | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
     ):
         self.problem, self.observe_phase, self.observe_velocity = problem, observe_phase, observe_velocity
         self.radius_scale, self.bonus_width = 1.0, 0.0
@@ -60,7 +62,7 @@ class PhasedVectorEnv(BatchedEnv):
         low[-2 if problem.waypoints else -1 :] = 0.0
         u_max = np.array([problem.u_max])
         spaces = Box(low, high, dtype=np.float64), Box(-u_max, u_max, dtype=np.float64)
-        super().__init__(num_envs, problem.steps, *spaces, render_mode)
+        super().__init__(num_envs, problem.steps, *spaces, render_mode, autoreset_mode)
         self._tabulate()
         self.x = (np.zeros(num_envs), np.zeros(num_envs))
         self.u = np.zeros(num_envs)  # the control of the step before, as applied
@@ -174,12 +176,13 @@ class PhasedEnv(SingleEnv):
 
 def make_phased_vector(env_id: str, num_envs: int = 1, **options) -> PhasedVectorEnv:
     """The batched environment of a problem in `PROBLEMS`; what `gymnasium.make_vec` calls."""
-    return PhasedVectorEnv(PROBLEMS[env_id], num_envs, **options)
+    check_options(PhasedVectorEnv, options)
+    return PhasedVectorEnv(PROBLEMS[env_id], num_envs, **options).sealed()
 
 
 def make_phased(env_id: str, **options) -> PhasedEnv:
     """The single environment of a problem in `PROBLEMS`; what `gymnasium.make` calls."""
-    return PhasedEnv(make_phased_vector(env_id, **options))
+    return PhasedEnv(make_phased_vector(env_id, **options)).sealed()
 
 
 def fly(env_id: str, policy: Callable, x0, **options) -> dict:

@@ -11,8 +11,9 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import ENV_ID_RE
 from gymnasium.spaces import Box
+from gymnasium.vector import AutoresetMode
 
-from common.batch import RENDERED, BatchedEnv, SingleEnv, of_batch
+from common.batch import RENDERED, BatchedEnv, SingleEnv, check_options, of_batch
 from common.errors import BadInput, refuse_unless
 from common.integration import rk4
 from rocket.dispersion import (
@@ -124,6 +125,7 @@ class RocketVectorEnv(BatchedEnv):
         dispersion: float = 0.0,
         observe_draw: bool = False,
         observe_mass: bool = False,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
     ):
         if action_frame not in ACTION_FRAMES:
             raise ValueError(f"action_frame is {action_frame!r}; it must be one of {', '.join(ACTION_FRAMES)}")
@@ -139,7 +141,7 @@ class RocketVectorEnv(BatchedEnv):
         self.dispersion, self.observe_draw, self.observe_mass = dispersion, observe_draw, observe_mass
         self.mass_weight, self.trajectory_weight, self.guidance_weight, self.guidance = 0.0, 0.0, 0.1, False
         self.terminal_scale = TERMINAL_SCALE
-        super().__init__(num_envs, 1, *self._spaces(), render_mode)
+        super().__init__(num_envs, 1, *self._spaces(), render_mode, autoreset_mode)
         self._build()
         self.end_time = self.rocket.end_time  # sets episode_steps, too
         self._axes = target_axes(self.rocket)
@@ -518,12 +520,13 @@ def flown_mission(mission: Mission, rocket: Rocket | None = None, table_isp: boo
 
 def make_rocket_vector(env_id: str, num_envs: int = 1, rocket: Rocket | None = None, **options) -> RocketVectorEnv:
     """The batched environment of a mission in `ROCKETS`, or of another rocket on it; `gymnasium.make_vec` calls it."""
-    return RocketVectorEnv(num_envs, flown_mission(ROCKETS[env_id], rocket), **options)
+    check_options(RocketVectorEnv, options)
+    return RocketVectorEnv(num_envs, flown_mission(ROCKETS[env_id], rocket), **options).sealed()
 
 
 def make_rocket(env_id: str, **options) -> RocketEnv:
     """The single environment of a mission in `ROCKETS`; what `gymnasium.make` calls."""
-    return RocketEnv(make_rocket_vector(env_id, **options))
+    return RocketEnv(make_rocket_vector(env_id, **options)).sealed()
 
 
 def fly_rocket(env_id: str, policy: Callable, end_time: float | None = None, draw=None, **options) -> dict:
