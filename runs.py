@@ -474,16 +474,24 @@ class Run:
         self.state = training_state(self.args, self.modules, self.envs, self.progress)
         if self.rank > 0:
             return self
-        self.solve_reference()
+        is_new = self.folder is None
         self.folder = self.folder or new_folder(f"{self.args.env_id}__{self.args.exp_name}__{self.args.seed}")
+        try:
+            if self.args.track:
+                track(self.args, self.folder.name)
+            self.solve_reference()
+        except BaseException:
+            if is_new:
+                with contextlib.suppress(OSError):  # what holds other runs, or files, stays
+                    self.folder.rmdir()
+                    self.folder.parent.rmdir()
+            raise
         print(f"run folder: {self.folder}", flush=True)
         for leftover in self.folder.glob(".*.tmp"):  # of a writer that was killed
             leftover.unlink()
         arguments = {**asdict(self.args), "resume": None}
         if self.args.save_model:
             files.write_json(self.folder / "args.json", arguments)
-        if self.args.track:
-            track(self.args, self.folder.name)
         self.writer = new_writer(self.folder, self.progress["global_step"] + 1, arguments)
         self.save()
         self.update_began = time.time()
@@ -622,11 +630,14 @@ def new_writer(folder, first_step, arguments):
 
 
 def track(args, name):
-    """Follow the run with Weights and Biases."""
+    """Follow the run with Weights and Biases; a resumed run goes on with the one that it began. One line on failure."""
     import wandb  # pyright: ignore[reportMissingImports] - optional, not among the requirements
 
-    names = {"project": args.wandb_project_name, "entity": args.wandb_entity, "name": name}
-    wandb.init(**names, sync_tensorboard=True, config=asdict(args), save_code=True)
+    names = {"project": args.wandb_project_name, "entity": args.wandb_entity, "name": name, "id": name}
+    try:
+        wandb.init(**names, resume="allow", sync_tensorboard=True, config=asdict(args), save_code=True)
+    except Exception as error:  # no login, no network, no such entity: wandb's errors have no common kind
+        fail(f"--track: Weights and Biases refuses the run ({error}); `wandb login` first, or leave --track out")
 
 
 # ---------------------------------------------------------------------------------------------------------------------

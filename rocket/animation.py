@@ -54,7 +54,7 @@ class AscentSheet(Sheet):
         self.orbit.set_axis_off()
         caption = "orbit if the engines stopped now, and the target"
         self.orbit.text((low + high) / 2, top, caption, ha="center", va="top", fontsize=8)
-        self.orbit.text(0, -0.6 * Re, "Earth", ha="center", va="center", fontsize=7, color="0.4")
+        self.orbit.text(0, -0.6 * Re, self.rocket.body, ha="center", va="center", fontsize=7, color="0.4")
 
     def _target_state(self) -> tuple[np.ndarray, np.ndarray]:
         """r (m) and v (m/s) in ECI at the target's perigee."""

@@ -152,7 +152,7 @@ def plot_target_plane(plane, insertion, lines: dict, rocket: Rocket):
             insertion.plot(angle[-1], altitude[-1], "o", color=style["color"], fillstyle="none")
             ends += [angle[0], angle[-1]]
     plane.add_patch(Circle((0, 0), Re / 1e3, color="0.85", zorder=0))
-    plane.text(0, 0, "Earth", ha="center", va="center")
+    plane.text(0, 0, rocket.body, ha="center", va="center")
     a, b = rocket.a / 1e6, rocket.a / 1e6 * np.sqrt(1 - rocket.e**2)  # half axes
     left, right = max(a * (1 + rocket.e), Re / 1e3), max(a * (1 - rocket.e), Re / 1e3)
     margin, half = 0.06 * left, 1.1 * max(b, Re / 1e3)

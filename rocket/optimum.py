@@ -262,12 +262,15 @@ def ascent_guesses(rocket: Rocket) -> list[tuple[float, float]]:
 
 
 def pitch_times(rocket: Rocket, end: float):
-    """The times (s) of `nine_pitch_angles`: the start, 30 s, every staging, quarters of the last burn until `end`.
+    """The times (s) of `nine_pitch_angles`: the start, 30 s, every staging, quarters of the longest burn, the `end`.
 
     Nine for four burns; with fewer, the longest intervals are halved until there are nine.
     """
-    times = {0.0, 30.0, *(burn.end for burn in rocket.burns[:-1]), *np.linspace(rocket.last_ignition, end, 5)}
-    times = np.array(sorted(times))
+    ends = [*(burn.end for burn in rocket.burns[:-1]), end]
+    begins = [0.0, *ends[:-1]]
+    burns = [(begin, stop) for begin, stop, burn in zip(begins, ends, rocket.burns) if not burn.is_coast]
+    longest = max(burns, key=lambda burn: burn[1] - burn[0])
+    times = np.array(sorted({0.0, 30.0, *ends, *np.linspace(*longest, 5)}))
     while len(times) < 9:
         longest = int(np.argmax(np.diff(times)))
         times = np.insert(times, longest + 1, times[longest : longest + 2].mean())
@@ -378,8 +381,8 @@ def nine_pitch_angles(env_id: str, flight: dict, rocket: Rocket) -> dict:
     frame = local_frame(flight["y"][:-1].T, target_axes(rocket)[2])
     up, along, cross = ((u * axis).sum(axis=0) for axis in frame)
     pitch, yaw, middle = np.arctan2(up, along), np.arcsin(np.clip(cross, -1, 1)), (t[:-1] + t[1:]) / 2
-    knots = pitch_times(rocket, t[-1])
-    pitch, yaw = (CubicSpline(knots, np.interp(knots, middle, angle))(middle) for angle in (pitch, yaw))
+    knots, burns = pitch_times(rocket, t[-1]), burning(rocket, middle)[0] > 0  # in a coast a direction means nothing
+    pitch, yaw = (CubicSpline(knots, np.interp(knots, middle[burns], angle[burns]))(middle) for angle in (pitch, yaw))
     if np.abs(np.arcsin(np.clip(cross, -1, 1))).max() <= IN_PLANE:
         yaw = np.zeros_like(pitch)
     return fly_angles(env_id, pitch, yaw, t[-1], rocket=rocket)

@@ -151,6 +151,11 @@ class Rocket:
         check_rocket(self)
 
     @property
+    def body(self) -> str:
+        """What figures call the planet, by its gravitational parameter."""
+        return "Earth" if abs(self.mu / 3.986e14 - 1) < 0.01 else "ground"
+
+    @property
     def last_ignition(self) -> float:
         """s: when the last burn begins."""
         return self.burns[-2].end if len(self.burns) > 1 else 0.0

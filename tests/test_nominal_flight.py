@@ -1,12 +1,15 @@
 """Dispersed flights beside the nominal one: what `before_training` keeps of it, how it is looked up, what is seen."""
 
+from dataclasses import replace
+
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
 
 import ppo_gtrxl_rocket as script
-from envs import ROCKETS, target_axes, target_orbit
+from envs import ROCKETS, Burn, register_rocket, target_axes, target_orbit
+from rocket.policy_constants import policy_constants
 
 CUTOFF = "RocketAscentCutoff-v0"
 SMALL = {"embed_dim": 8, "num_heads": 2, "mlp_dim": 8, "hidden_dim": 8, "num_blocks": 1, "memory_length": 4}
@@ -187,3 +190,26 @@ def test_the_policy_itself_flies_it():
     again, _, _ = make_agent()
     script.before_training(again, args, env_options)
     torch.testing.assert_close(again.nominal_flight, kept, rtol=1e-5, atol=1e-5)
+
+
+def test_in_a_coast_flights_are_compared_with_its_beginning():
+    """There the energy stays: a rounding error of it must not choose the row. Only the angle goes on."""
+    two_stages = ROCKETS["TwoStageLEO-v0"].rocket
+    first, second = two_stages.burns
+    burns = (first, Burn(300.0, second.engines), Burn(600.0, ()), Burn(693.0, second.engines))
+    register_rocket("Restart-v0", replace(two_stages, burns=burns, end_time=693.0), cutoff=True)
+    script.BUFFERS["Restart-v0"] = policy_constants(ROCKETS["Restart-v0"].rocket)
+    try:
+        agent, *_ = make_agent(env_id="Restart-v0")
+        envs = gym.make_vec("Restart-v0", num_envs=1, action_frame="local")
+        script.fly_nominal(agent, climb, envs)
+        rows = agent.nominal_flight
+        coast = rows[rows[:, 0] == 2]
+        assert len(coast) == 150
+        phase = torch.full((5, 1), 2 / 3, dtype=torch.float64)
+        energy = coast[0, 1] + torch.tensor([[-1e-3], [-1e-9], [0.0], [1e-9], [1e-3]], dtype=torch.float64)
+        found = script.nominal_at(agent, phase, energy)
+        np.testing.assert_array_equal(found, coast[:1, 2:].expand(5, -1))
+        np.testing.assert_allclose(coast[:, 2:9], coast[:1, 2:9].expand(len(coast), -1), atol=2e-6)
+    finally:
+        del script.BUFFERS["Restart-v0"], ROCKETS["Restart-v0"]

@@ -488,3 +488,16 @@ def test_a_solve_ends_in_its_seconds_and_is_heard_of(monkeypatch, capsys):
         optimum.optimise_ascent(case)
     assert time.monotonic() - begin < 10
     assert capsys.readouterr().err.splitlines() == ["rocket ascent far: IPOPT is looking for it, at most 3 s"]
+
+
+def test_the_restart_of_the_page(monkeypatch):
+    """Its file as printed, and its numbers: burn, coast, burn again."""
+    page = (ROOT / "docs" / "rocket.md").read_text()
+    (code,) = re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL)
+    monkeypatch.setattr(envs, "register_rocket", lambda env_id, rocket, cutoff: None)
+    names = {}
+    exec(code, names)
+    numbers, flight, _ = optimum.solve_and_fly(optimum.AscentCase("restart", names["ROCKET"]))
+    assert f"{flight['final_mass_kg']:.1f}" == "24459.7" and f"{flight['final_time_s']:.2f}" == "1135.04"
+    assert flight["error_norm"] < 1e-9
+    assert "24 459.7 kg at 1135.04 s" in page

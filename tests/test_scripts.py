@@ -365,6 +365,7 @@ def test_flags_of_the_machine(tmp_path, monkeypatch):
     assert compiled == ["encode", "encode_step"] and not torch.backends.cudnn.deterministic
     (names,) = tracked
     assert (names["project"], names["name"]) == ("mine", run_folder().name)
+    assert (names["id"], names["resume"]) == (run_folder().name, "allow")  # a resumed run goes on with it
 
 
 @pytest.mark.slow
@@ -1054,6 +1055,22 @@ def test_tracking_without_wandb_says_how_to_install_it(refuses, monkeypatch):
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == "wandb" else find(name, *a))
     assert "pip install wandb" in refuses("--track")
+
+
+def test_tracking_without_a_login_is_one_line_before_any_solve(refuses, monkeypatch):
+    """And leaves no run folder."""
+
+    def init(**names):
+        raise RuntimeError("api_key not configured (no-tty)")
+
+    wandb = types.ModuleType("wandb")
+    wandb.__spec__, wandb.init = importlib.machinery.ModuleSpec("wandb", None), init
+    monkeypatch.setitem(sys.modules, "wandb", wandb)
+    monkeypatch.setattr(runs.Run, "solve_reference", None)
+    assert "--track: Weights and Biases refuses the run (api_key not configured (no-tty)); `wandb login`" in refuses(
+        "--track"
+    )
+    assert not list(Path("runs").glob("*"))
 
 
 @pytest.mark.parametrize(
