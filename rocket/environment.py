@@ -137,6 +137,7 @@ class RocketVectorEnv(BatchedEnv):
         self.rocket, self.cutoff = self.mission.rocket, mission.cutoff
         self._last_phase = len(self.rocket.burns) - 1
         self._coasts = np.array([burn.is_coast for burn in self.rocket.burns])  # by phase
+        self._has_coasts = bool(self._coasts.any())
         self.action_frame, self.observe_phase = action_frame, observe_phase
         self.dispersion, self.observe_draw, self.observe_mass = dispersion, observe_draw, observe_mass
         self.mass_weight, self.trajectory_weight, self.guidance_weight, self.guidance = 0.0, 0.0, 0.1, False
@@ -432,7 +433,7 @@ class RocketVectorEnv(BatchedEnv):
         t = self.t
         distance, energy = self._progress()
         turn = np.sqrt(((u - self.u) ** 2).sum(axis=0)) * (t > 0)
-        if self._coasts.any():  # a direction without thrust counts for nothing, nor does the turn away from it
+        if self._has_coasts:  # a direction without thrust counts for nothing, nor does the turn away from it
             coasts = self._coasts[phase]
             turn = turn * ~(coasts | self._coasted)
             self._coasted = coasts
