@@ -303,7 +303,8 @@ def optimise(env_id: str, x0, defect: Callable = shooting, in_circles: bool = Fa
         solutions = [_solve_start(job) for job in jobs]
     else:
         chunk = -(-len(jobs) // (4 * processes))
-        with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
+        spawn = get_context("spawn")
+        with ProcessPoolExecutor(processes, spawn, limit.update, ({"seconds": limit["seconds"]},)) as pool:
             solutions = list(pool.map(_solve_start, jobs, chunksize=chunk))
     u, cost, feasible, multipliers = zip(*solutions)
     return np.array(u), np.array(cost), np.array(feasible), np.array(multipliers)
@@ -515,7 +516,7 @@ def parse_args(argv=None):
     for command in set(commands.choices.values()):  # a problem with two names is there twice
         command.add_argument("--json", type=output_file, metavar="F", help="write the numbers to this file")
         command.add_argument("--npz", type=output_file, metavar="F", help="write the trajectories to this file")
-        at_most = f"after which a solve is given up, all its tries together: default {limit['seconds']:g}"
+        at_most = f"limit of each solve, a rocket's with all its tries: default {limit['seconds']:g}"
         command.add_argument(
             "--solve-seconds", type=integer(1, 86400), default=limit["seconds"], metavar="S", help=at_most
         )

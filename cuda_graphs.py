@@ -129,13 +129,17 @@ class CapturedAct:
 
 
 class CapturedGradient:
-    """In place of a script's `ppo_gradient`: a graph for each size of a minibatch."""
+    """In place of a script's `ppo_gradient`: a graph for each size of a minibatch.
+
+    The optimiser's graph reads the gradients at one place. So all sizes bring theirs to the first size's tensors.
+    """
 
     def __init__(self, gradient):
         self.gradient = gradient
         self.batch = None  # whose tensors the graphs read
         self.copied = None  # the batch that was copied into them
         self.graphs = {}
+        self.gradients = None
 
     def __call__(self, args, agent, batch, mb, ent_coef):
         if self.batch is None:
@@ -152,14 +156,18 @@ class CapturedGradient:
         graph, episodes, losses, gradients = self.graphs[len(mb)]
         episodes.copy_(mb)
         graph.replay()
-        for parameter, gradient in zip(agent.parameters(), gradients):
-            parameter.grad = gradient
+        if gradients is not self.gradients:
+            torch._foreach_copy_(self.gradients, gradients)
+        weights = [weight for weight in agent.parameters() if weight.requires_grad]
+        for weight, gradient in zip(weights, self.gradients, strict=True):
+            weight.grad = gradient
         return dict(losses)
 
     def capture(self, args, agent, mb):
         episodes = mb.clone()
         graph, losses = capture(lambda: self.gradient(args, agent, self.batch, episodes, self.ent_coef))
-        gradients = [parameter.grad for parameter in agent.parameters()]
+        gradients = [weight.grad for weight in agent.parameters() if weight.requires_grad]
+        self.gradients = self.gradients or gradients
         self.graphs[len(mb)] = (graph, episodes, losses, gradients)
 
 

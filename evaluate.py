@@ -88,22 +88,28 @@ def shorten(run_dir) -> Path:
 
     OSError or BadInput says what is missing, ValueError what its script says when it cannot fly the policy.
     """
-    run_dir, shorter = Path(run_dir), Path(run_dir) / "bfloat16"
-    policy = shorter / "agent.safetensors"
+    run_dir = Path(run_dir)
     args = read_checkpoint(run_dir / "agent.safetensors", {"exp_name": str}, flag="")["args"]
-    shorter.mkdir(exist_ok=True)
-    for path in run_dir.glob("events.out.tfevents.*"):
-        write_bytes(shorter / path.name, path.read_bytes())
-    write_bfloat16(run_dir / "agent.safetensors", policy)
     script = Path(__file__).with_name(f"{args['exp_name']}.py")
-    flags = {"checkpoint": policy, "eval-json": shorter / "eval.json", "eval-npz": shorter / "eval.npz"}
-    if "dispersion" in args:
-        flags["dispersion"] = args["dispersion"]
-    command = [sys.executable, script, "--eval-only", "--no-cuda", *(f"--{name}={flags[name]}" for name in flags)]
-    flown = subprocess.run(command, stderr=subprocess.PIPE, text=True)
-    if flown.returncode:
-        raise ValueError(f"{policy}: {flown.stderr.strip()}")
-    return shorter
+    if not script.is_file():
+        raise ValueError(
+            f"{run_dir}: its exp_name is {args['exp_name']!r}; it must be that of a script, which flies it"
+        )
+    with tempfile.TemporaryDirectory() as name:
+        staged = Path(name)
+        for path in run_dir.glob("events.out.tfevents.*"):
+            write_bytes(staged / path.name, path.read_bytes())
+        policy = staged / "agent.safetensors"
+        write_bfloat16(run_dir / "agent.safetensors", policy)
+        flags = {"checkpoint": policy, "eval-npz": staged / "eval.npz", "eval-json": staged / "eval.json"}
+        if "dispersion" in args:
+            flags["dispersion"] = args["dispersion"]
+        command = [sys.executable, script, "--eval-only", "--no-cuda", *(f"--{name}={flags[name]}" for name in flags)]
+        flown = subprocess.run(command, stderr=subprocess.PIPE, text=True)
+        if flown.returncode:
+            raise ValueError(f"{run_dir}: {flown.stderr.strip()}")
+        move(staged, run_dir / "bfloat16", staged / "eval.json", replaced=())
+    return run_dir / "bfloat16"
 
 
 def keep_excerpt(path, task):

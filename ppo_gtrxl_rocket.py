@@ -327,12 +327,11 @@ def nominal_at(agent, phase, energy):
     first_of_burn = torch.searchsorted(burns, burn)
     last_of_burn = torch.searchsorted(burns, burn, right=True) - 1
     after = torch.searchsorted(burns + energies, key)  # the first row whose key is not smaller
-    coasts = energies[last_of_burn] - energies[first_of_burn.clamp(max=len(rows) - 1)] < 1e-6
-    after = torch.where(coasts, first_of_burn + 1, after)
     after = torch.minimum(torch.maximum(after, first_of_burn + 1), last_of_burn).clamp(min=1)[..., 0]
     share = (energy - rows[after - 1, 1:2]) / (rows[after, 1:2] - rows[after - 1, 1:2]).clamp(min=1e-7)
-    share = torch.where(coasts, 0.0, share)
-    return torch.lerp(rows[after - 1, 2:], rows[after, 2:], share)
+    begins = first_of_burn.clamp(max=len(rows) - 1)
+    coasts = energies[last_of_burn] - energies[begins] < 1e-6
+    return torch.where(coasts, rows[begins[..., 0], 2:], torch.lerp(rows[after - 1, 2:], rows[after, 2:], share))
 
 
 @torch.no_grad()

@@ -42,9 +42,9 @@ class BatchedEnv(Sealed, VectorEnv):
     """What every problem shares: step counters, checks of the action, and autoreset.
 
     With `autoreset_mode` "SameStep", the default, an episode that ends is followed by the next one's first observation
-    in the same step; its own last values are `final_obs` and `final_info`. With "NextStep", as CleanRL and Gymnasium's
-    wrappers expect it, that step returns the episode's last observation and, in the info, its last values; the step
-    after it ignores that environment's action and returns the next episode's first observation, with reward 0.
+    in the same step; its own last values are `final_obs` and `final_info`. With "NextStep", as some of Gymnasium's
+    vector wrappers expect it, that step returns the episode's last observation and, in the info, its last values. The
+    step after it ignores that environment's action and returns the next episode's first observation, with reward 0.
     https://farama.org/Vector-Autoreset-Mode
 
     A problem gives the spaces, `episode_steps` (the longest episode) and three methods:
@@ -131,6 +131,8 @@ class BatchedEnv(Sealed, VectorEnv):
         begins = self._waiting.copy()
         if begins.any():
             self._restart(begins, None)  # they are flown along, and put back to a start behind that
+            if np.shape(actions) == self.action_space.shape:
+                actions = np.where(begins[:, None], 1.0, actions)
         obs, rewards, terminated, final = self.advance(actions)
         if begins.any():
             self._restart(begins, None)
@@ -261,10 +263,17 @@ def of_batch(name: str, doc: str) -> property:
     return property(lambda env: getattr(env.batch, name), lambda env, value: setattr(env.batch, name, value), doc=doc)
 
 
-def check_options(environment: type, options: dict):
-    """BadInput for an option that an environment's constructor does not take."""
-    allowed = [
-        name for name in inspect.signature(environment).parameters if name not in ("num_envs", "problem", "mission")
-    ]
+def check_options(environment: type, options: dict, *others: str):
+    """BadInput for an option that is neither of an environment's constructor nor among the `others`."""
+    given_otherwise = ("num_envs", "problem", "mission")
+    taken = [name for name in inspect.signature(environment).parameters if name not in given_otherwise]
+    allowed = [*taken, *others]
     for name, value in options.items():
         refuse_unless(name in allowed, f"the option {name}", repr(value), f"must be one of {', '.join(allowed)}")
+
+
+def refuse_autoreset(options: dict):
+    """BadInput where a single environment is asked for an autoreset: it has none."""
+    mode = options.get("autoreset_mode")
+    allowed = "must not be given: a single environment is reset by its user; use gym.make_vec"
+    refuse_unless(mode is None, "autoreset_mode", repr(mode), allowed)

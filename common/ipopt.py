@@ -9,7 +9,8 @@ import time
 from contextlib import contextmanager
 
 PATIENCE = 5.0  # s without a line
-limit = {"seconds": 120}  # of all tries of one solve; `python baselines.py ID --solve-seconds` sets it
+LEAST = 0.1  # s: less is none; IPOPT refuses a limit of 0
+limit = {"seconds": 120}  # of a rocket's solve, all its tries; `python baselines.py ID --solve-seconds` sets it
 
 
 class SolveClock:
@@ -25,13 +26,18 @@ class SolveClock:
 
     def seconds_left(self) -> float:
         """Until the limit; 0 beyond it."""
-        return max(limit["seconds"] - self.seconds(), 0.0)
+        left = limit["seconds"] - self.seconds()
+        return left if left > LEAST else 0.0
 
     def speak(self):
         """The line, once, on stderr."""
         if not self.has_spoken and self.seconds() > PATIENCE:
             self.has_spoken = True
-            print(f"{self.what}: IPOPT is looking for it, at most {limit['seconds']:g} s", file=sys.stderr, flush=True)
+            print(
+                f"{self.what}: IPOPT is still solving; it stops after {limit['seconds']:g} s",
+                file=sys.stderr,
+                flush=True,
+            )
 
     def callback(self, program: dict):
         """For `nlpsol`: called after each of IPOPT's iterations."""

@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
 
-from common.batch import RENDERED, BatchedEnv, SingleEnv, check_options, of_batch
+from common.batch import RENDERED, BatchedEnv, SingleEnv, check_options, of_batch, refuse_autoreset
 from common.errors import BadInput
 from common.integration import rk4
 from phased.problem import PROBLEMS, Problem
@@ -182,6 +182,7 @@ def make_phased_vector(env_id: str, num_envs: int = 1, **options) -> PhasedVecto
 
 def make_phased(env_id: str, **options) -> PhasedEnv:
     """The single environment of a problem in `PROBLEMS`; what `gymnasium.make` calls."""
+    refuse_autoreset(options)
     return PhasedEnv(make_phased_vector(env_id, **options)).sealed()
 
 

@@ -13,7 +13,7 @@ from gymnasium.envs.registration import ENV_ID_RE
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
 
-from common.batch import RENDERED, BatchedEnv, SingleEnv, check_options, of_batch
+from common.batch import RENDERED, BatchedEnv, SingleEnv, check_options, of_batch, refuse_autoreset
 from common.errors import BadInput, refuse_unless
 from common.integration import rk4
 from rocket.dispersion import (
@@ -521,12 +521,13 @@ def flown_mission(mission: Mission, rocket: Rocket | None = None, table_isp: boo
 
 def make_rocket_vector(env_id: str, num_envs: int = 1, rocket: Rocket | None = None, **options) -> RocketVectorEnv:
     """The batched environment of a mission in `ROCKETS`, or of another rocket on it; `gymnasium.make_vec` calls it."""
-    check_options(RocketVectorEnv, options)
+    check_options(RocketVectorEnv, options, "rocket")
     return RocketVectorEnv(num_envs, flown_mission(ROCKETS[env_id], rocket), **options).sealed()
 
 
 def make_rocket(env_id: str, **options) -> RocketEnv:
     """The single environment of a mission in `ROCKETS`; what `gymnasium.make` calls."""
+    refuse_autoreset(options)
     return RocketEnv(make_rocket_vector(env_id, **options)).sealed()
 
 

@@ -52,9 +52,12 @@ class Engine:
         burns = self.propellant > 0 or self.thrust == 0
         refuse_unless(burns, "an engine's propellant", self.propellant, "must be positive where it has thrust")
         if self.thrust and abs(self.flown_isp / self.isp - 1) > ISP_TOLERANCE:
-            flown = f"its thrust, propellant and burn_time make {self.flown_isp:.4g} s, and these three are flown"
+            whose = f"engine {self.name!r}'s" if self.name else "an engine's"
+            flown = (
+                f"its thrust, propellant and burn_time make {self.flown_isp:.4g} s, which is flown without table_isp"
+            )
             consistent = f"a burn_time of {self.propellant * G0 * self.isp / self.thrust:.6g} s would agree with it"
-            warnings.warn(f"an engine's isp is {self.isp:g} s, but {flown}; {consistent}", stacklevel=3)
+            warnings.warn(f"{whose} isp is {self.isp:g} s, but {flown}; {consistent}", stacklevel=3)
 
     @property
     def flown_isp(self) -> float:
@@ -351,7 +354,7 @@ def burns_of_group(rocket: Rocket, engine: Engine, k: int) -> tuple[int, ...]:
 def check_rocket(rocket: Rocket):
     """BadInput where a rocket cannot be; a warning where it can, at a price that is easily overlooked."""
     for name in ("a", "e", "i", "raan", "argp"):
-        allowed = "must be a number: all five elements are given, a free one has to be chosen"
+        allowed = "must be a number: all five elements are given; give a free one a value"
         refuse_unless(getattr(rocket, name) is not None, f"a rocket's {name}", None, allowed)
     refuse_unless_finite("a rocket's", rocket)
     for name in ("mu", "Re", "H", "dt", "a", "end_time"):

@@ -44,7 +44,7 @@ def test_large_weights_become_bfloat16(tmp_path):
 
 @pytest.mark.slow
 def test_a_shorter_policy_is_flown_anew(tmp_path, monkeypatch):
-    """With every tensor rounded the rocket still arrives, a little off; its run folder is left alone."""
+    """With tensors of 2000 numbers rounded the rocket still arrives, a little off; its run folder is left alone."""
     run = tmp_path / "run"
     run.mkdir()
     shutil.copy(ROOT / "results" / "rocket_cutoff" / "agent.safetensors", run)

@@ -51,7 +51,8 @@ def test_next_step_autoreset_is_same_step_with_a_step_between(env_id):
     for key, value in info["final_info"].items():
         np.testing.assert_array_equal(late_info[key][ended], value[ended])
 
-    _, reward, ended_again, _, info = late.step(np.full(late.action_space.shape, 0.5))
+    action = np.where(ended[:, None], np.nan, 0.5) * np.ones(late.action_space.shape)  # ignored where NaN
+    _, reward, ended_again, _, info = late.step(action)
     assert (reward[ended] == 0).all() and not ended_again[ended].any()
     begun = late.unwrapped.t[ended]
     assert (begun == 0).all()
@@ -71,7 +72,7 @@ def test_environments_that_end_at_different_steps_wait_for_nobody():
     assert restarts > 2 and not ended[0]
 
 
-def test_cleanrls_wrappers_take_the_native_batch():
+def test_gymnasiums_wrappers_take_the_native_batch():
     batch = make("RocketAscentCutoff-v0", 2, autoreset_mode=gym.vector.AutoresetMode.NEXT_STEP)
     env = NormalizeReward(NormalizeObservation(RecordEpisodeStatistics(batch)))
     env.reset(seed=1)
@@ -122,6 +123,12 @@ def test_the_wrappers_way_to_an_attribute():
     env = gym.make("RocketAscentCutoff-v0", action_frame="local")
     env.unwrapped.mass_weight = 3.0
     assert env.get_wrapper_attr("mass_weight") == 3.0 == env.unwrapped.batch.mass_weight
+
+
+@every_kind
+def test_a_single_environment_has_no_autoreset(env_id):
+    with pytest.raises(BadInput, match="autoreset_mode is 'NextStep'; it must not be given"):
+        gym.make(env_id, autoreset_mode="NextStep")
 
 
 @every_kind
