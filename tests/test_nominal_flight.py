@@ -212,4 +212,5 @@ def test_in_a_coast_flights_are_compared_with_its_beginning():
         np.testing.assert_array_equal(found, coast[:1, 2:].expand(5, -1))
         np.testing.assert_allclose(coast[:, 2:9], coast[:1, 2:9].expand(len(coast), -1), atol=2e-6)
     finally:
-        del script.BUFFERS["Restart-v0"], ROCKETS["Restart-v0"]
+        for registry in (script.BUFFERS, ROCKETS, gym.registry):
+            del registry["Restart-v0"]
