@@ -2,7 +2,8 @@
 
 At Table 1's size a GPU computes most operations in a few microseconds, and PyTorch needs as long to launch each one. A
 CUDA graph records the launches of a function once and repeats them together. It reads and writes the same memory each
-time, so inputs are copied to where the graph reads them. What decides (NaN, the KL limit, the optimiser) stays outside.
+time, so inputs are copied to where the graph reads them. What decides whether a step is taken (NaN, the KL limit) stays
+outside.
 
 https://pytorch.org/docs/stable/notes/cuda.html#cuda-graphs
 """
@@ -38,6 +39,7 @@ def speed_up(agent, average, optimizer, gradient):
 
 
 def on_gpu(agent):
+    """Whether the agent's weights are on a GPU."""
     return agent.actor_logstd.device.type == "cuda"
 
 

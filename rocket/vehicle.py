@@ -53,10 +53,8 @@ class Engine:
         refuse_unless(burns, "an engine's propellant", self.propellant, "must be positive where it has thrust")
         if self.thrust and abs(self.flown_isp / self.isp - 1) > ISP_TOLERANCE:
             whose = f"engine {self.name!r}'s" if self.name else "an engine's"
-            flown = (
-                f"its thrust, propellant and burn_time make {self.flown_isp:.4g} s, which is flown without table_isp"
-            )
-            consistent = f"a burn_time of {self.propellant * G0 * self.isp / self.thrust:.6g} s would agree with it"
+            flown = f"its thrust, propellant and burn_time make {self.flown_isp:.4g} s, and these three rule"
+            consistent = f"a burn_time of {self.propellant * G0 * self.isp / self.thrust:.6g} s would agree"
             warnings.warn(f"{whose} isp is {self.isp:g} s, but {flown}; {consistent}", stacklevel=3)
 
     @property
