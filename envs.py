@@ -5,14 +5,15 @@ Importing this module registers (section "Numerical Simulations" of the paper; t
     DoubleIntegrator-v0  DoubleIntegratorWaypoints-v0  VanDerPol-v0  VanDerPolWaypoints-v0
     RocketAscent-v0  RocketAscentCutoff-v0
 
-and the rockets in the files of `vehicles/`.
+and the problems and rockets in the files of `problems/` and `vehicles/`.
 
 `gymnasium.make(id)` gives one environment, `gymnasium.make_vec(id, num_envs=N)` N of them, stepped together in float64
 NumPy with no Python loop over environments. The small problems' environment is `phased/environment.py`, the rocket's
 `rocket/environment.py`; what all share is `common/batch.py`. What a user of an environment needs is imported here, too.
 Reading order: dynamics, tables, registration.
-To add a problem of the first kind: write its dynamics, its table, and one line in `PROBLEMS`. To add a rocket: a file
-in `vehicles/` that calls `register_rocket`. To add a family: a folder, and one line `add_family` at the end.
+To add a problem of the first kind: a file in `problems/` with its dynamics and its table, which calls
+`register_problem`. To add a rocket: a file in `vehicles/` that calls `register_rocket`. To add a family: a folder, and
+one line `add_family` at the end.
 """
 
 from __future__ import annotations
@@ -22,15 +23,21 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-import gymnasium as gym
-import numpy as np  # noqa: F401 - for the dynamics of your own
-
+from batched.registry import RegisteredIds
+from batched.task import BatchedTask
 from common.batch import BatchedEnv, SingleEnv
 from common.errors import BadInput
 from common.integration import rk4
 from common.tasks import add_family
-from phased.environment import PhasedEnv, PhasedVectorEnv, fly, make_phased, make_phased_vector
-from phased.problem import PROBLEMS, Phase, Problem
+from phased.environment import (
+    PhasedEnv,
+    PhasedVectorEnv,
+    fly,
+    make_phased,
+    make_phased_vector,
+    register_problem,
+)
+from phased.problem import PROBLEMS, Phase, Problem, uniform
 from rocket.dispersion import DISPERSION, Dispersion, draw_bounds, draw_names, draw_vehicles
 from rocket.dynamics import ascent_dynamics
 from rocket.environment import (
@@ -61,8 +68,8 @@ __all__ = [  # what users import from here
     "Problem", "Rocket", "RocketEnv", "RocketVectorEnv", "SingleEnv",
     "ascent_dynamics", "delta_v", "draw_bounds", "draw_names", "draw_vehicles", "flown_mission", "fly", "fly_rocket",
     "launch_raan", "local_frame", "make_phased", "make_phased_vector", "make_rocket", "make_rocket_vector",
-    "orbit_vectors", "orbital_elements", "register_rocket", "rk4", "specific_energy", "target_axes", "target_orbit",
-    "terminal_error",
+    "orbit_vectors", "orbital_elements", "own_ids", "register_problem", "register_rocket", "rk4", "specific_energy",
+    "target_axes", "target_orbit", "terminal_error", "uniform",
 ]  # fmt: skip
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -94,6 +101,7 @@ DOUBLE_INTEGRATOR = Problem(
     phases=(Phase(steps=50, target=(0.0, 0.0), radius=0.05, R=0.1, Qf=20.0, bonus=20.0),),
     x_max=(57.0, 22.0),  # |x2| <= 1 + u T, |x1| <= 1 + T + u T^2 / 2, and room for rounding
     single_optimum=True,
+    u_scale=1.0,  # an action is u itself
 )
 
 DOUBLE_INTEGRATOR_WAYPOINTS = Problem(
@@ -106,6 +114,7 @@ DOUBLE_INTEGRATOR_WAYPOINTS = Problem(
     ),
     x_max=(162.0, 32.0),
     single_optimum=True,
+    u_scale=1.0,  # an action is u itself
 )
 
 VAN_DER_POL = Problem(
@@ -115,6 +124,7 @@ VAN_DER_POL = Problem(
     phases=(Phase(steps=70, target=(0.0, 0.0), radius=0.05, R=1.0, Qf=20.0, bonus=20.0),),
     x_max=(19.0, 19.0),  # |x|' <= epsilon |x| + u, so |x(T)| <= (sqrt 2 + u / epsilon) e^(epsilon T) - u / epsilon
     single_optimum=True,
+    u_scale=1.0,  # an action is u itself
 )
 
 VAN_DER_POL_WAYPOINTS = Problem(
@@ -128,40 +138,41 @@ VAN_DER_POL_WAYPOINTS = Problem(
     ),
     x_max=(52.0, 52.0),
     single_optimum=True,
+    u_scale=1.0,  # an action is u itself
 )
-
-PROBLEMS |= {
-    problem.env_id: problem
-    for problem in (DOUBLE_INTEGRATOR, DOUBLE_INTEGRATOR_WAYPOINTS, VAN_DER_POL, VAN_DER_POL_WAYPOINTS)
-}
 
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Registration (no max_episode_steps: the horizon is the problem's own, and its end, by our reading, a true one)
 # ---------------------------------------------------------------------------------------------------------------------
 
-for _env_id in PROBLEMS:
-    gym.register(
-        id=_env_id,
-        entry_point="envs:make_phased",
-        vector_entry_point="envs:make_phased_vector",
-        kwargs={"env_id": _env_id},
-    )
+BUILT_IN = (DOUBLE_INTEGRATOR, DOUBLE_INTEGRATOR_WAYPOINTS, VAN_DER_POL, VAN_DER_POL_WAYPOINTS)
+for _problem in BUILT_IN:
+    register_problem(_problem)
 
 
-def import_vehicles():
-    """Run every file of `vehicles/`; one that cannot be is left out with a line that says why."""
-    for path in sorted(Path(__file__).parent.glob("vehicles/*.py")):
+def import_files_of(folder: str):
+    """Run every file of a folder of tables; one that cannot be is left out with a line that says why."""
+    for path in sorted(Path(__file__).parent.glob(f"{folder}/*.py")):
         try:
-            importlib.import_module(f"vehicles.{path.stem}")
+            importlib.import_module(f"{folder}.{path.stem}")
         except BadInput as error:
-            print(f"vehicles/{path.name} is left out: {error}", file=sys.stderr)
+            print(f"{folder}/{path.name} is left out: {error}", file=sys.stderr)
         except Exception as error:  # whatever is wrong with one file must not stop the others
             why = f"{type(error).__name__}: {error}"
-            print(f"vehicles/{path.name} is left out: {why}", file=sys.stderr)
+            print(f"{folder}/{path.name} is left out: {why}", file=sys.stderr)
 
 
 register_rocket("RocketAscent-v0", **vars(PAPER_MISSION))
 register_rocket("RocketAscentCutoff-v0", **vars(replace(PAPER_MISSION, cutoff=True, floor_km=110.0)))
-import_vehicles()
+import_files_of("problems")
+import_files_of("vehicles")
 add_family(ROCKETS, RocketTask.of)
+WITHOUT_OPTIMUM = RegisteredIds(PROBLEMS, ROCKETS)
+add_family(WITHOUT_OPTIMUM, BatchedTask)
+
+
+def own_ids() -> list[str]:
+    """The ids of a user's own: tables of `problems/`, and registered environments derived from `BatchedEnv`."""
+    built_in = {problem.env_id for problem in BUILT_IN}
+    return [env_id for env_id in (*PROBLEMS, *WITHOUT_OPTIMUM) if env_id not in built_in]

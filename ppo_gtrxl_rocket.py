@@ -527,7 +527,7 @@ class Agent(nn.Module):
         blocks = [GTrXLBlock(d, args.num_heads, args.memory_length, args.mlp_dim) for _ in range(args.num_blocks)]
         self.blocks = nn.ModuleList(blocks)
         self.actor = nn.Sequential(linear(d, hidden, gain=2**0.5), nn.GELU(), linear(hidden, actions, gain=0.01))
-        self.actor[-1].bias.data = torch.tensor(INITIAL_ACTION)
+        self.actor[-1].bias.data[:] = torch.tensor(INITIAL_ACTION)
         self.critic = nn.Sequential(linear(d, hidden, gain=2**0.5), nn.GELU(), linear(hidden, 1))
         learned = not isinstance(args.log_std, str)  # a number: learned from there; points: set by them
         self.actor_logstd = nn.Parameter(torch.full((actions,), value_at(args.log_std, 0.0)), requires_grad=learned)

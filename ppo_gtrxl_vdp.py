@@ -2,6 +2,7 @@
 
     python ppo_gtrxl_vdp.py --seed 1                                 # by our recipe, as results/vdp
     python ppo_gtrxl_vdp.py --seed 1 --env-id VanDerPolWaypoints-v0  # three waypoints, one policy
+    python ppo_gtrxl_vdp.py --seed 1 --env-id CartPoleSwingUp-v0            # a table of problems/, yours too
     python ppo_gtrxl_vdp.py --seed 1 --recipe paper                  # plain PPO with Table 1
     python ppo_gtrxl_vdp.py --eval-only --checkpoint results/vdp/agent.safetensors
 
@@ -25,7 +26,9 @@ from torch.distributions import Normal
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 import runs
+from common.tasks import ForEachId
 from cuda_graphs import speed_up
+from envs import own_ids
 from runs import Schedule, all_reduce_sum
 
 
@@ -140,11 +143,10 @@ def recipe(args):
 
 
 # Problem: input and action --------------------------------------------------------------------------------------------
-ENV_IDS = ("VanDerPol-v0", "VanDerPolWaypoints-v0")
+ENV_IDS = ("VanDerPol-v0", "VanDerPolWaypoints-v0", *own_ids())  # and problems of your own
 ENV_OPTIONS = ("observe_phase", "observe_velocity")  # arguments of the environments
-FIXED_OPTIONS = {}  # those that no flag sets (the rocket's script has one)
-SIZES = dict(zip(ENV_IDS, (3, 6)))  # of an observation
-BUFFERS = {env_id: {"observation_scale": [1.0] * n} for env_id, n in SIZES.items()}  # `features` reads agent.<name>
+FIXED_OPTIONS = {"scaled_action": True}  # those that no flag sets
+BUFFERS = ForEachId(ENV_IDS, runs.observation_scale)  # by id; `features` reads agent.<name>
 INITIAL_ACTION = [0.0]  # the policy's output before training, in units of the bound
 
 
@@ -160,9 +162,14 @@ def mean_action(output, action_scale):
 
 def describe(episodes, metrics):
     """What a progress line says of the sampled episodes (`final_info` arrays) and of the last evaluation, if any."""
-    hit = " ".join(f"{share:4.0%}" for share in episodes["hit"].mean(axis=0))
-    ratio = f"  ratio {metrics['ratio_of_sums']:.4f}" if "ratio_of_sums" in metrics else ""
-    return f"return {episodes['episodic_return'].mean():8.2f}  cost {episodes['cost'].mean():7.3f}  hits {hit}{ratio}"
+    words = f"return {episodes['episodic_return'].mean():8.2f}"
+    if "cost" in episodes:
+        words += f"  cost {episodes['cost'].mean():7.3f}"
+    if "hit" in episodes:
+        words += "  hits " + " ".join(f"{share:4.0%}" for share in episodes["hit"].mean(axis=0))
+    if "ratio_of_sums" in metrics:
+        words += f"  ratio {metrics['ratio_of_sums']:.4f}"
+    return words
 
 
 # Problem, ours: what only training changes ----------------------------------------------------------------------------
@@ -180,7 +187,7 @@ def set_curriculum(envs, args, progress):
     """
     group = round(value_at(args.flights_per_start, progress))
     envs.flights_per_start = group
-    if envs.problem.waypoints:
+    if envs.has_circles:
         envs.radius_scale = math.exp(value_at(args.log_radius, progress))
         envs.bonus_width = BONUS_WIDTH if group > 1 else 0.0
     return group
@@ -352,7 +359,7 @@ class Agent(nn.Module):
         blocks = [GTrXLBlock(d, args.num_heads, args.memory_length, args.mlp_dim) for _ in range(args.num_blocks)]
         self.blocks = nn.ModuleList(blocks)
         self.actor = nn.Sequential(linear(d, hidden, gain=2**0.5), nn.GELU(), linear(hidden, actions, gain=0.01))
-        self.actor[-1].bias.data = torch.tensor(INITIAL_ACTION)
+        self.actor[-1].bias.data[:] = torch.tensor(INITIAL_ACTION)
         self.critic = nn.Sequential(linear(d, hidden, gain=2**0.5), nn.GELU(), linear(hidden, 1))
         learned = not isinstance(args.log_std, str)  # a number: learned from there; points: set by them
         self.actor_logstd = nn.Parameter(torch.full((actions,), value_at(args.log_std, 0.0)), requires_grad=learned)

@@ -33,6 +33,7 @@ import tyro
 
 import evaluate
 from common import files
+from common.batch import make_batch
 from common.checkpoints import COUNTERS, read_checkpoint
 from common.curves import read_curve
 from common.errors import BadInput, NoOptimum
@@ -184,6 +185,11 @@ def resolve(args, typed, kind, recipe, env_options, buffers):
             args.checkpoint = first
             saved, decided = take_checkpoint_args(args, kind, typed, env_options, buffers)
     return replace(kind(), **{**changes, **decided, "checkpoint": args.checkpoint}), saved
+
+
+def observation_scale(env_id):
+    """The constant of an agent by which `features` divides observations: the environment's."""
+    return {"observation_scale": make_batch(env_id, 1).observation_scale.tolist()}
 
 
 def options_of(args, env_options):
@@ -386,7 +392,7 @@ def make_envs(args, env_options):
     """
     rank, processes = rank_and_world_size()
     share = args.num_envs // processes + (rank < args.num_envs % processes)
-    envs = gym.make_vec(args.env_id, num_envs=share, **env_options)
+    envs = make_batch(args.env_id, share, **env_options)
     seed = args.seed + 2**31 * rank
     envs.reset(seed=seed + 2**40 if seed in (args.eval_seed, TRAINING_EVAL_SEED) else seed)
     return envs

@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.envs.registration import load_env_creator
 from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv
@@ -55,8 +56,9 @@ class BatchedEnv(Sealed, VectorEnv):
     and state (N, n), arrays of their own; `_make_sheet()` returns the drawing, whose `frame(t, u, y)` is a flight's
     picture.
 
-    Every problem has two more attributes: `dt`, the step in s, and `phase` (N,), the 0-based phase in which the running
-    steps begin.
+    Every problem has more attributes: `dt`, the step in s (1 unless given); `phase` (N,), the 0-based phase in which
+    the running steps begin (0 unless given); and `observation_scale`, a usual size of each observation (1 unless
+    given), by which the networks of our scripts divide it.
 
     With the attribute `flights_per_start` G, to be set before a `reset` and only in training, environment k flies start
     k // G, so that flights differ by their actions alone (1: each flies its own start; the last group is smaller where
@@ -102,7 +104,19 @@ class BatchedEnv(Sealed, VectorEnv):
         self.action_space = batch_space(single_action_space, num_envs)
         self.t = np.zeros(num_envs, dtype=np.int64)  # steps flown in the running episode
         self.flights_per_start = 1
+        self.observation_scale = np.ones(single_observation_space.shape)
+        self.has_circles = False  # True: `radius_scale` and `bonus_width` of the small problems can be set
         self._was_reset = False
+
+    @property
+    def dt(self) -> float:
+        """The step in s."""
+        return 1.0
+
+    @property
+    def phase(self) -> np.ndarray:
+        """The 0-based phase (N,) of the running steps."""
+        return np.zeros(self.num_envs, dtype=np.int64)
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
         """Start every environment anew; returns (N, obs) float64 and an empty info."""
@@ -277,3 +291,19 @@ def refuse_autoreset(options: dict):
     mode = options.get("autoreset_mode")
     allowed = "must not be given: a single environment is reset by its user; use gym.make_vec"
     refuse_unless(mode is None, "autoreset_mode", repr(mode), allowed)
+
+
+def make_batch(env_id: str, num_envs: int, **env_options) -> BatchedEnv:
+    """N environments of an id, with those options that it takes.
+
+    Raises BadInput where it is not derived from `BatchedEnv`, or an option that it does not take would hide something.
+    """
+    entry = gym.spec(env_id).vector_entry_point
+    taken = inspect.signature(load_env_creator(entry) if isinstance(entry, str) else entry).parameters
+    takes_all = any(parameter.kind is inspect.Parameter.VAR_KEYWORD for parameter in taken.values())
+    for name, value in env_options.items():
+        refuse_unless(value or takes_all or name in taken, name, value, f"is no option of {env_id}; leave it out")
+    envs = gym.make_vec(env_id, num_envs, **{k: v for k, v in env_options.items() if takes_all or k in taken})
+    if not isinstance(envs.unwrapped, BatchedEnv):
+        raise BadInput(f"env_id is {env_id!r}; its vector_entry_point must make an environment derived from BatchedEnv")
+    return envs.unwrapped

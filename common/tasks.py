@@ -1,10 +1,10 @@
 """What the project asks of an environment id: one `Task` object for each, the same few methods for every family.
 
-A *family* is a kind of environment with tables of its own: the small problems (`phased/`), the rockets (`rocket/`).
-`evaluate.py`, `runs.py`, the command of `baselines.py` and the benchmarks call `task_of(env_id)` and never ask which
-family it is. A new family is a folder with a class of this shape, and one line `add_family(TABLES, make_task)` in
-`envs.py`. The small problems' line is in `baselines.py`, which solves them: their ids are known once that is imported,
-as `evaluate.py` does.
+A *family* is a kind of environment: the small problems (`phased/`) and the rockets (`rocket/`), which have tables, and
+every other environment that is derived from `BatchedEnv` (`batched/`). `evaluate.py`, `runs.py`, the command of
+`baselines.py` and the benchmarks call `task_of(env_id)` and never ask which family it is. A new family is a folder with
+a class of this shape, and one line `add_family(TABLES, make_task)` in `envs.py`. The small problems' line is in
+`baselines.py`, which solves them: their ids are known once that is imported, as `evaluate.py` does.
 """
 
 from __future__ import annotations
@@ -137,6 +137,24 @@ def add_family(tables: Mapping[str, Any], make_task: Callable[[str], Task]) -> N
     """Make a family's ids known, or known anew. `tables` is kept: an id that is added to it later is known, too."""
     FAMILIES[:] = [family for family in FAMILIES if family[0] is not tables]
     FAMILIES.append((tables, make_task))
+
+
+class ForEachId(Mapping):
+    """A mapping by environment id whose values are made when they are asked for."""
+
+    def __init__(self, env_ids, make: Callable[[str], Any]):
+        self.env_ids, self.make = tuple(env_ids), make
+
+    def __getitem__(self, env_id: str):
+        if env_id not in self.env_ids:
+            raise KeyError(env_id)
+        return self.make(env_id)
+
+    def __iter__(self):
+        return iter(self.env_ids)
+
+    def __len__(self) -> int:
+        return len(self.env_ids)
 
 
 def env_ids() -> list[str]:

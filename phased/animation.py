@@ -1,14 +1,15 @@
-"""The small problems' picture that moves: the phase plane, with position and control over time."""
+"""The small problems' picture that moves: the phase plane, with position and control over time, or all over time."""
 
 from __future__ import annotations
 
 import numpy as np
 from matplotlib.collections import LineCollection
 from matplotlib.lines import Line2D
-from matplotlib.patches import Circle
 
 from drawing.animation import DOT, HEIGHT, LOOKS, SIDES, WIDTH, Animation, Flight, Sheet, room
-from drawing.style import BOUNDARY, OPTIMUM, POLICY, SHOWN, TARGET
+from drawing.style import BOUNDARY, OPTIMUM, POLICY, TARGET
+from drawing.time_plots import TimePlots, stairs
+from phased.figures import add_circle, flights_of, mark_table
 from phased.problem import Problem
 
 
@@ -18,13 +19,13 @@ class PhasePlane(Sheet):
     def __init__(self, problem: Problem, title: str = "", compared: bool = False):
         super().__init__(title or problem.env_id)
         self.problem, self.styles = problem, [POLICY, OPTIMUM] if compared else [POLICY]
-        self.plane = self.panel((0.075, 0.16, 0.46, 0.765), xlabel="position $x_1$", ylabel="velocity $x_2$")
+        position, velocity = problem.state_labels
+        self.plane = self.panel((0.075, 0.16, 0.46, 0.765), xlabel=position, ylabel=velocity)
         horizon = problem.steps * problem.dt
-        self.position = self.panel((0.62, 0.58, 0.365, 0.345), ylabel="position $x_1$", xlim=(0, horizon))
-        self.control = self.panel((0.62, 0.16, 0.365, 0.345), xlabel="time (s)", ylabel="control $u$")
-        bound = problem.u_max
-        self.control.set(xlim=(0, horizon), ylim=(-1.15 * bound, 1.15 * bound))
-        for side in (-bound, bound):
+        self.position = self.panel((0.62, 0.58, 0.365, 0.345), ylabel=position, xlim=(0, horizon))
+        self.control = self.panel((0.62, 0.16, 0.365, 0.345), xlabel="time (s)", ylabel=problem.control_labels[0])
+        self.control.set(xlim=(0, horizon), ylim=widened(*problem.u_box[:, 0]))
+        for side in problem.u_box[:, 0]:
             self.control.axhline(side, **{**BOUNDARY, "linestyle": "--"})
         self._mark_phases()
         self.lines = [
@@ -46,14 +47,15 @@ class PhasePlane(Sheet):
         """Green: each phase's circle, and its target over the phase's time."""
         self.circles, self.ends, start = [], [], 0.0
         for k, phase in enumerate(self.problem.phases, start=1):
-            self.circles.append(
-                self.plane.add_patch(Circle(phase.target, phase.radius, fill=False, zorder=5, **TARGET))
-            )
-            if self.problem.waypoints:
+            target = self.problem.targets_of(phase)
+            if circle := add_circle(self.problem, phase, self.plane, zorder=5):
+                self.circles.append(circle)
+            if self.problem.waypoints and None not in target:
                 style = {"color": TARGET["color"], "weight": "bold", "fontsize": 9}
-                self.plane.annotate(f"{k}", phase.target, (6, 6), textcoords="offset points", zorder=5, **style)
+                self.plane.annotate(f"{k}", target, (6, 6), textcoords="offset points", zorder=5, **style)
             end = start + phase.steps * self.problem.dt
-            self.position.plot([start, end], [phase.target[0]] * 2, linestyle="--", zorder=3, **TARGET)
+            if target[0] is not None:
+                self.position.plot([start, end], [target[0]] * 2, linestyle="--", zorder=3, **TARGET)
             if k < len(self.problem.phases):
                 for ax in (self.position, self.control):
                     ax.axvline(end, **BOUNDARY)
@@ -93,16 +95,31 @@ class PhasePlane(Sheet):
         self.clock.set_text(f"t = {time:.1f} s{phase}")
 
 
-def stairs(flight: Flight) -> np.ndarray:
-    """The corners (2 K, 2) of the control over time, held over each step."""
-    times = np.repeat(flight.t, 2)[1:-1]
-    return np.column_stack([times, np.repeat(flight.u[:, 0], 2)])
+def widened(low: float, high: float) -> tuple[float, float]:
+    """The limits of an axis that shows both bounds."""
+    margin = 0.075 * (high - low)
+    return low - margin, high + margin
 
 
-def phase_plane_animation(problem: Problem, arrays: dict, title: str) -> Animation:
+def time_plots(problem: Problem, title: str = "", compared: bool = False) -> TimePlots:
+    """Each state and each control over time, with the table's targets and bounds."""
+
+    def mark(panels):
+        mark_table(problem, panels)
+        return [Line2D([], [], **TARGET, linestyle="--", label="target")]
+
+    labels = [*problem.state_labels, *problem.control_labels]
+    horizon = problem.steps * problem.dt
+    return TimePlots(title or problem.env_id, labels, problem.states, horizon, compared, mark)
+
+
+def sheet_of(problem: Problem, title: str = "", compared: bool = False) -> Sheet:
+    """The sheet that a problem is drawn on."""
+    is_plane = problem.states == 2 and problem.controls == 1 and not problem.has_events
+    return (PhasePlane if is_plane else time_plots)(problem, title, compared)
+
+
+def problem_animation(problem: Problem, arrays: dict, title: str) -> Animation:
     """The first flights of an evaluation, policy beside optimum."""
-    sides = []
-    for suffix, name in SIDES.items():
-        flown = zip(arrays[f"u{suffix}"][:SHOWN], arrays[f"x{suffix}"][:SHOWN])
-        sides.append([Flight.of(arrays["t"], u[..., None], x, name) for u, x in flown])
-    return Animation.of(PhasePlane(problem, title, compared=True), sides)
+    sides = [flights_of(problem, arrays, suffix) for suffix in SIDES]
+    return Animation.of(sheet_of(problem, title, compared=True), sides)

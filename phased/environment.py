@@ -11,31 +11,40 @@ from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
 
 from common.batch import RENDERED, BatchedEnv, SingleEnv, check_options, of_batch, refuse_autoreset
-from common.errors import BadInput
-from common.integration import rk4
-from phased.problem import PROBLEMS, Problem
+from common.errors import BadInput, refuse_unless
+from common.integration import falling_root
+from phased.problem import LARGEST_SCORE, PROBLEMS, Phase, Problem
 
 # the observed target moves to the new waypoint over these first steps of a phase: the paper's number, linearly by ours
 TRANSITION_STEPS = 5
 
 
 class PhasedVectorEnv(BatchedEnv):
-    """The double integrator and Van der Pol families: N copies of a `Problem` with one or several phases.
+    """The double integrator and Van der Pol families, and problems of a user's own: N copies of a `Problem`.
 
     Observation: the paper's o_t = [x1, x2, x1_target, x2_target, tau, phi] with several phases, [x1, x2, tau] with one
     (ours); tau = t / T, phi the 0-based phase over (phases - 1). The target that is seen moves to a new waypoint over
-    the first `TRANSITION_STEPS` of its phase. Action: u, clipped at the control bound.
+    the first `TRANSITION_STEPS` of its phase. Action: u, clipped to the set of controls. A vector whose norm is bounded
+    from below keeps its direction, and a zero vector points along the last axis.
 
     Reward: the paper's r_t, -(dx'Q dx + R u^2) with dx the distance to the phase's target before the step; a phase's
     last step adds -Qf |dx|^2 + B 1[|dx| <= r] after it, so that an episode's rewards sum to bonus - J. The paper prints
-    r_t for one phase and target 0; that each phase has its own is ours. The end of the horizon is `terminated` (time is
-    observed).
+    r_t for one phase and target 0; that each phase has its own is ours, and so are a table's functions and bounds
+    (`Problem`). The end of the horizon is `terminated` (time is observed).
 
-    `final_info`: `episodic_return` (with the true radii), `cost`, `cost_state`, `cost_control`, `cost_terminal`, each
-    (N,), and `hit` and `terminal_error` (the distance to the target at each phase's end), each (N, phases).
+    A step in which a phase ends by its event ends there, too, and weights count in proportion to its length. The next
+    phase begins at that moment. With events tau is the time over the longest one.
 
-    `observe_phase=False` shows tau and phi as 0, `observe_velocity=False` x2. `reset(options={"x0": (N, 2)})` sets the
-    starts.
+    `final_info`: `episodic_return` (with the true radii), `cost`, its parts `cost_state`, `cost_control`,
+    `cost_terminal` (or those of `Problem.parts`), each (N,), and `hit` and `terminal_error` (the distance to the target
+    at each phase's end, in radii where the circle is an ellipse), each (N, phases); with events `final_time` (N,) s,
+    with scores `draw` (N, k).
+
+    `observe_phase=False` shows tau and phi as 0, `observe_velocity=False` the velocities. `observe_draw` shows the
+    standard scores behind them, `observe_command` the action of the step before (0 at first). With `scaled_action` an
+    action of 0 is the middle of the set of controls, and one of 1 is `Problem.u_unit` more: our scripts use it.
+
+    `reset(options={"x0": (N, n)})` sets the starts, `{"draw": (N, k)}` the scores.
 
     Attributes that only training changes, to be set before a `reset`: `radius_scale`, a scalar or one number a phase,
     enlarges the radii in which the *reward* pays the bonus (1 is the paper); `bonus_width`, the distance beyond them
@@ -50,26 +59,69 @@ class PhasedVectorEnv(BatchedEnv):
         num_envs: int = 1,
         observe_phase: bool = True,
         observe_velocity: bool = True,
+        observe_draw: bool = False,
+        observe_command: bool = False,
+        scaled_action: bool = False,
         render_mode: str | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
     ):
         self.problem, self.observe_phase, self.observe_velocity = problem, observe_phase, observe_velocity
+        self.observe_draw, self.observe_command, self.scaled_action = observe_draw, observe_command, scaled_action
+        allowed = "needs `velocities` in the table, the states that it hides"
+        refuse_unless(observe_velocity or problem.hidden_velocities, "observe_velocity", observe_velocity, allowed)
+        allowed = "needs `scores` in the table, which it shows"
+        refuse_unless(problem.scores or not observe_draw, "observe_draw", observe_draw, allowed)
         self.radius_scale, self.bonus_width = 1.0, 0.0
-        target_max = np.max([np.abs(phase.target) for phase in problem.phases], axis=0)
-        target_max[target_max == 0] = 1.0  # of velocity, where all waypoints are at rest: a box must have a width
-        high = np.array([*problem.x_max, *target_max, 1.0, 1.0] if problem.waypoints else [*problem.x_max, 1.0])
-        low = -high
-        low[-2 if problem.waypoints else -1 :] = 0.0
-        u_max = np.array([problem.u_max])
-        spaces = Box(low, high, dtype=np.float64), Box(-u_max, u_max, dtype=np.float64)
+        self._centre, self._unit = problem.u_centre, problem.u_unit
+        action_box = (problem.u_box - self._centre) / self._unit if scaled_action else problem.u_box
+        spaces = Box(*self._observation_box(action_box), dtype=np.float64), Box(*action_box, dtype=np.float64)
         super().__init__(num_envs, problem.steps, *spaces, render_mode, autoreset_mode)
         self._tabulate()
-        self.x = (np.zeros(num_envs), np.zeros(num_envs))
-        self.u = np.zeros(num_envs)  # the control of the step before, as applied
-        self._running_cost = np.zeros((2, num_envs))  # state and control part of the running episode's cost
-        self._terminal_cost = np.zeros(num_envs)
+        self.observation_scale = self._scale_of_observations()
+        self.has_circles = problem.circles_count
+        self.x = tuple(np.zeros(num_envs) for _ in range(problem.states))
+        # the control of the step before, as applied: (N,), or (N, m) where the table has a tuple of them
+        self.u = np.zeros((num_envs, problem.controls) if isinstance(problem.u_max, tuple) else num_envs)
+        self.time = np.zeros(num_envs)  # s
+        self.draw = np.zeros((num_envs, problem.scores))
+        self._parameters = problem.hidden(self.draw)
+        self._phase = np.zeros(num_envs, dtype=np.int64)
+        self._step_in_phase = np.zeros(num_envs, dtype=np.int64)
+        self._command = np.zeros((num_envs, problem.controls))
+        self._costs = {part: np.zeros(num_envs) for part in problem.parts}
         self._bonus = np.zeros(num_envs)
         self._terminal_error = np.zeros((num_envs, len(problem.phases)))
+
+    def _observation_box(self, action_box):
+        """Least and greatest observation."""
+        problem = self.problem
+        high = [*problem.x_max]
+        low = [-bound for bound in high]
+        if problem.waypoints:
+            for component in zip(*map(problem.targets_of, problem.phases)):
+                largest = max(abs(target or 0.0) for target in component)
+                high.append(largest or 1.0)  # all at rest: a box must have a width
+                low.append(-high[-1])
+        clocks = 2 if problem.waypoints else 1
+        high += [1.0] * clocks
+        low += [0.0] * clocks
+        scores = problem.scores if self.observe_draw else 0
+        high += [LARGEST_SCORE] * scores
+        low += [-LARGEST_SCORE] * scores
+        if self.observe_command:
+            least, greatest = action_box
+            low += np.minimum(least, 0.0).tolist()
+            high += np.maximum(greatest, 0.0).tolist()
+        return np.array(low), np.array(high)
+
+    def _scale_of_observations(self):
+        """A usual size of each observation: the table's for states and targets, 1 for the rest."""
+        scale = np.ones(self.single_observation_space.shape)
+        n = self.problem.states
+        scale[:n] = self.problem.scale
+        if self.problem.waypoints:
+            scale[n : 2 * n] = self.problem.scale
+        return scale
 
     @property
     def dt(self) -> float:
@@ -79,92 +131,274 @@ class PhasedVectorEnv(BatchedEnv):
     @property
     def phase(self) -> np.ndarray:
         """The 0-based phase (N,) of the running steps; after the last step the last one."""
-        return self._phase[np.minimum(self.t, self.problem.steps - 1)]
+        return np.minimum(self._phase, len(self.problem.phases) - 1)
 
     def _tabulate(self):
-        """The tables by step: `t` picks a row, whatever the phase."""
-        phases, T = self.problem.phases, self.problem.steps
-        self._phase = np.repeat(np.arange(len(phases)), [phase.steps for phase in phases])  # (T,)
-        self._phase_ends = np.append(self._phase[1:] != self._phase[:-1], True)  # (T,) a phase ends after this step
-        self._target, self._Q = (np.array([getattr(phases[k], name) for k in self._phase]) for name in ("target", "Q"))
-        self._R = np.array([phases[k].R for k in self._phase])
-        targets = np.array([phase.target for phase in phases])
-        step_in_phase = np.concatenate([np.arange(phase.steps) for phase in phases])
-        blend = np.minimum(step_in_phase / TRANSITION_STEPS, 1.0)[:, None]
-        seen = (1 - blend) * targets[np.maximum(self._phase - 1, 0)] + blend * targets[self._phase]
-        clock = np.stack([np.arange(T + 1) / T, np.append(self._phase, self._phase[-1]) / max(len(phases) - 1, 1)], 1)
-        clock *= self.observe_phase
-        # what is observed beside x, by step 0..T
-        target_and_clock = np.hstack([np.vstack([seen, targets[-1]]), clock])
-        self._seen_beside_x = target_and_clock if self.problem.waypoints else clock[:, :1]
+        """The tables by phase: `_phase` picks a row."""
+        problem, phases = self.problem, self.problem.phases
+        self._steps = np.array([phase.steps for phase in phases])
+        targets = [[target or 0.0 for target in problem.targets_of(phase)] for phase in phases]
+        self._target = np.array(targets)  # (phases, n)
+        self._Q = np.array([problem.state_weights(phase) for phase in phases])
+        self._R = np.array([problem.control_weights(phase) for phase in phases])
+        self._low, self._high = problem.u_box[:, :, None]
+        self._limits = problem.limits[:, :, None]
+        self._hidden = () if self.observe_velocity else problem.hidden_velocities
+        self._has_events = problem.has_events
+        # by phase and step in it, up to TRANSITION_STEPS: the target that is seen
+        blend = np.minimum(np.arange(TRANSITION_STEPS + 1) / TRANSITION_STEPS, 1.0)[:, None]
+        before = self._target[[max(k - 1, 0) for k in range(len(phases))]]
+        self._seen_target = np.stack([(1 - blend) * old + blend * new for old, new in zip(before, self._target)])
+        self._moves = [(k, phase) for k, phase in enumerate(phases) if phase.end is not None]
+        self._alike = len({(phase.f, phase.running) for phase in phases}) == 1  # one dynamics for all
 
     def _start(self, mask, options):
-        if options.keys() - {"x0"}:
-            raise BadInput(f"reset options are {options!r}; the only one is 'x0'")
-        count, bound = int(mask.sum()), self.problem.x0_max
+        self._refuse_options(options)
+        problem, count = self.problem, int(mask.sum())
+        draw = self.draw[mask]
+        if problem.scores:
+            draw = self._draw_starts(lambda n: problem.draw_scores(self.np_random, n), count)
+        if "draw" in options:
+            draw = self._checked("draw", options["draw"], problem.scores)[mask]
         if "x0" in options:
-            x0 = np.asarray(options["x0"], dtype=np.float64)
-            if x0.shape != (self.num_envs, 2) or not np.isfinite(x0).all():
-                raise ValueError(f"options['x0'] must be finite, of shape ({self.num_envs}, 2); got {options['x0']!r}")
+            x0 = self._checked("x0", options["x0"], problem.states)[mask]
+        elif callable(problem.x0):
+            x0 = np.column_stack([np.broadcast_to(x, count) for x in problem.x0(tuple(draw.T))])
         else:
-            x0 = self._draw_starts(lambda n: self.np_random.uniform(-bound, bound, (n, 2)), count)
+            x0 = self._draw_starts(lambda n: problem.starts_in_box(self.np_random, n), count)
         for component, start in zip(self.x, x0.T):
             component[mask] = start
-        self._running_cost[:, mask] = 0.0
-        self._terminal_cost[mask] = self._bonus[mask] = self._terminal_error[mask] = 0.0
+        self.draw[mask] = draw
+        for mine, new in zip(self._parameters, problem.hidden(draw)):
+            mine[mask] = new
+        for part in self._costs.values():
+            part[mask] = 0.0
+        self.time[mask] = self._bonus[mask] = self._command[mask] = self._terminal_error[mask] = 0.0
+        self._phase[mask] = self._step_in_phase[mask] = 0
+
+    def _refuse_options(self, options):
+        """BadInput for an option of `reset` that this table does not have."""
+        known = ["x0", "draw"] if self.problem.scores else ["x0"]
+        if options.keys() - set(known):
+            allowed = "the only one is 'x0'" if len(known) == 1 else "they may be 'x0' and 'draw'"
+            raise BadInput(f"reset options are {options!r}; {allowed}")
+
+    def _checked(self, name, given, width):
+        """An option of `reset` as an array (N, width); BadInput where it is none."""
+        try:
+            rows = np.asarray(given, dtype=np.float64)
+        except (TypeError, ValueError):
+            rows = np.empty(0)
+        if rows.shape != (self.num_envs, width) or not np.isfinite(rows).all():
+            raise BadInput(f"options[{name!r}] must be finite, of shape ({self.num_envs}, {width}); got {given!r}")
+        return rows
 
     def _observe(self):
         """The paper's o_t of the running steps."""
-        position, velocity = self.x
-        return np.column_stack([position, velocity * self.observe_velocity, self._seen_beside_x[self.t]])
+        problem, phase = self.problem, self.phase
+        columns = [x * 0.0 if k in self._hidden else x for k, x in enumerate(self.x)]
+        if problem.waypoints:
+            running = np.where(self._phase == phase, self._step_in_phase, TRANSITION_STEPS)
+            columns.append(self._seen_target[phase, np.minimum(running, TRANSITION_STEPS)])
+        share = self.time / (problem.steps * problem.dt) if self._has_events else self.t / problem.steps
+        columns.append(np.minimum(share, 1.0) * self.observe_phase)
+        if problem.waypoints:
+            columns.append(phase / (len(problem.phases) - 1) * self.observe_phase)
+        if self.observe_draw:
+            columns.append(self.draw)
+        if self.observe_command:
+            columns.append(self._command)
+        return np.column_stack(columns)
+
+    def _applied(self, actions):
+        """The controls (m, N) that actions (N, m) apply."""
+        problem = self.problem
+        u = (actions * self._unit + self._centre if self.scaled_action else actions).T
+        if problem.u_norm is None:
+            return np.clip(u, self._low, self._high)
+        norm = np.sqrt((u * u).sum(axis=0))
+        upward = np.zeros_like(u)
+        upward[-1] = 1.0
+        direction = np.where(norm > 0, u / np.where(norm > 0, norm, 1.0), upward)
+        return direction * np.clip(norm, *problem.u_norm)
 
     def _advance(self, actions):
-        t = self.t
-        u = np.clip(actions[:, 0], -self.problem.u_max, self.problem.u_max)
-        d1, d2 = self.x[0] - self._target[t, 0], self.x[1] - self._target[t, 1]
-        cost = np.stack([self._Q[t, 0] * d1 * d1 + self._Q[t, 1] * d2 * d2, self._R[t] * u * u])
-        self._running_cost += cost
-        rewards = -cost.sum(axis=0)
-        self.x = rk4(self.problem.f, self.x, u, self.problem.dt)
-        ends = self._phase_ends[t]
-        self.u, self.t = u, t + 1
+        problem = self.problem
+        u = self._applied(actions)
+        before, phase = self.x, self.phase
+        length = np.full(self.num_envs, problem.dt)
+        controls = problem.as_control(u)
+        self.x, running = self._fly(before, controls, phase, problem.dt)
+        running = np.zeros(self.num_envs) + running  # a table's `running` may be one number for all
+        if self._has_events:
+            has_ended = self._phase >= len(problem.phases)  # in an earlier step, and not reset: it stays where it is
+            self.x = tuple(np.where(has_ended, x, after) for x, after in zip(before, self.x))
+        ends = self._step_in_phase + 1 == self._steps[phase]
+        for k, event in self._moves:
+            met = self._end_by_event(k, event, before, controls, running, length)
+            ends = ends | met
+        costs = self._step_costs(before, u, running, length, phase)
+        for part, cost in costs.items():
+            self._costs[part] += cost
+        rewards = -sum(costs.values(), np.zeros(self.num_envs))
+        self.u = u.T.copy() if isinstance(problem.u_max, tuple) else u[0]
+        self._command = (u.T - self._centre) / self._unit if self.scaled_action else u.T.copy()
+        self.t, self.time = self.t + 1, self.time + length
+        self._step_in_phase += 1
         if ends.any():
             rewards += self._end_phase(np.flatnonzero(ends))
-        return rewards, self.t == self.problem.steps, self._final_info
+        return rewards, self._phase >= len(problem.phases), self._final_info
+
+    def _fly(self, x, u, phase, h):
+        """The states h seconds later, and the integral of `running` over them: of each environment by its phase."""
+        problem, phases = self.problem, self.problem.phases
+        if self._alike or (phase == phase[0]).all():
+            return problem.step(phases[phase[0]], x, u, self._parameters, h)
+        after, cost = np.empty((problem.states, self.num_envs)), np.zeros(self.num_envs)
+        for k in np.unique(phase):
+            there = phase == k
+            after[:, there], cost[there] = self._fly_some(there, phases[k], x, u, h)
+        return tuple(after), cost
+
+    def _fly_some(self, there, phase: Phase, x, u, h):
+        """As `Problem.step`, for the environments in the mask or of the indices `there`."""
+        some = lambda values: tuple(value[there] for value in values)  # noqa: E731
+        u = some(u) if isinstance(u, tuple) else u[there]
+        return self.problem.step(phase, some(x), u, some(self._parameters), h)
+
+    def _end_by_event(self, k, phase: Phase, before, u, running, length):
+        """The environments (N,) in phase k whose event falls through 0 in this step; puts them where it does."""
+        problem, p = self.problem, self._parameters
+        event = problem.with_parameters(phase.end, p)
+        begin, end = np.zeros(self.num_envs) + event(before), np.zeros(self.num_envs) + event(self.x)
+        falls = (self._phase == k) & (begin > 0)
+        until = np.full(self.num_envs, problem.dt)  # s, where it is below 0
+        dips = np.flatnonzero(falls & (end > 0))
+        if len(dips):
+            lowest, value = self._dip(dips, phase, before, u, begin[dips], end[dips])
+            until[dips], end[dips] = lowest, value
+        met = falls & (end <= 0)
+        there = np.flatnonzero(met)
+        if len(there):
+            _, _, of_event, fly = self._view(there, phase, before, u)
+            h = falling_root(lambda h: of_event(fly(h)[0]), begin[there], end[there], until[there])
+            x, cost = fly(h)
+            for component, at_event in zip(self.x, x):
+                component[there] = at_event
+            running[there] = cost
+            length[there] = h
+        return met
+
+    def _view(self, there, phase: Phase, before, u):
+        """Of the environments `there`: dynamics f(x), states at a step's begin, event(x), and fly(h), as `step`."""
+        problem = self.problem
+        x, p = (tuple(value[there] for value in values) for values in (before, self._parameters))
+        u = tuple(value[there] for value in u) if isinstance(u, tuple) else u[there]
+        f = problem.with_parameters(phase.f or problem.f, p)
+        event = problem.with_parameters(phase.end, p)
+        return lambda x: f(x, u), x, event, lambda h: problem.step(phase, x, u, p, h)
+
+    def _dip(self, there, phase: Phase, before, u, begin, end):
+        """When in this step the event is least, (n,) s, and its value there, of environments where both ends are above.
+
+        A soft touchdown is such a dip: held for the rest of the step, its thrust would lift off again. The least value
+        is that of the cubic through both ends with the event's slopes; it is evaluated only where the event falls at
+        the begin and rises at the end.
+        """
+        dt = self.problem.dt
+        f, x, event, fly = self._view(there, phase, before, u)
+        after = tuple(component[there] for component in self.x)
+        slope, slope_after = (dt * slope_along(event, y, f(y)) for y in (x, after))
+        turns = np.flatnonzero((slope < 0) & (slope_after > 0))
+        lowest, value = np.full(len(there), dt), end.copy()
+        if len(turns):
+            m0, m1, g0, g1 = slope[turns], slope_after[turns], begin[turns], end[turns]
+            a, b = 6 * (g0 - g1) + 3 * (m0 + m1), 6 * (g1 - g0) - 4 * m0 - 2 * m1
+            share = -2 * m0 / (b + np.sqrt(b * b - 4 * a * m0))
+            lowest[turns] = dt * np.clip(share, 0.0, 1.0)
+            _, _, event, fly = self._view(there[turns], phase, before, u)
+            value[turns] = event(fly(lowest[turns])[0])
+        return lowest, value
+
+    def _step_costs(self, before, u, running, length, phase) -> dict:
+        """The parts of the cost that a step adds, (N,) each."""
+        problem, costs = self.problem, {}
+        if "state" in self._costs:
+            share = length / problem.dt if self._has_events else 1.0
+            d = [x - target for x, target in zip(before, self._target[phase].T)]
+            costs["state"] = share * sum(q * di * di for q, di in zip(self._Q[phase].T, d))
+            costs["control"] = share * sum(r * ui * ui for r, ui in zip(self._R[phase].T, u))
+        if "running" in self._costs:
+            costs["running"] = running
+        if "bounds" in self._costs:
+            low, high = self._limits
+            x = np.array(self.x)
+            beyond = np.maximum(np.maximum(low - x, x - high), 0.0)
+            costs["bounds"] = problem.bound_price * (beyond / problem.scale[:, None]).sum(axis=0) * length
+        return costs
 
     def _end_phase(self, ending):
         """Terminal cost and bonus of the environments `ending`, whose phase ends here; returns their reward, (N,)."""
-        last, phases = self.t[ending] - 1, self.problem.phases
-        k = self._phase[last]
-        radius, Qf, B = (np.array([getattr(phase, name) for phase in phases])[k] for name in ("radius", "Qf", "bonus"))
-        scale = np.broadcast_to(self.radius_scale, len(phases))[k]
-        error = np.hypot(self.x[0][ending] - self._target[last, 0], self.x[1][ending] - self._target[last, 1])
-        self._terminal_error[ending, k] = error
-        self._terminal_cost[ending] += Qf * error**2
-        self._bonus[ending] += B * (error <= radius)
-        share = error <= scale * radius
-        if self.bonus_width:
-            share = np.clip(1 - (error - scale * radius) / self.bonus_width, 0, 1)
         rewards = np.zeros(self.num_envs)
-        rewards[ending] = -Qf * error**2 + B * share
+        phases = self.problem.phases
+        of_phase = self.phase[ending]
+        for k in np.unique(of_phase):
+            some = ending[of_phase == k]
+            x, p = (tuple(value[some] for value in values) for values in (self.x, self._parameters))
+            scale = np.broadcast_to(self.radius_scale, len(phases))[k]
+            cost, error, radius = end_of_phase(self.problem, phases[k], x, p)
+            self._terminal_error[some, k] = error
+            self._costs["terminal"][some] += cost
+            self._bonus[some] += phases[k].bonus * (error <= radius)
+            share = error <= scale * radius
+            if self.bonus_width and phases[k].has_circle:
+                share = np.clip(1 - (error - scale * radius) / self.bonus_width, 0, 1)
+            rewards[some] = -cost + phases[k].bonus * share
+        self._phase[ending] += 1
+        self._step_in_phase[ending] = 0
         return rewards
 
     def _final_info(self):
-        state, control = self._running_cost.copy()
-        cost = state + control + self._terminal_cost
-        parts = {"cost_state": state, "cost_control": control, "cost_terminal": self._terminal_cost.copy()}
+        parts = {f"cost_{part}": cost.copy() for part, cost in self._costs.items()}
+        cost = sum(parts.values(), np.zeros(self.num_envs))
         error = self._terminal_error.copy()
-        hit = error <= [phase.radius for phase in self.problem.phases]
-        return {"episodic_return": self._bonus - cost, "cost": cost, **parts, "hit": hit, "terminal_error": error}
+        hit = error <= [phase.circle_radius for phase in self.problem.phases]
+        info = {"episodic_return": self._bonus - cost, "cost": cost, **parts, "hit": hit, "terminal_error": error}
+        if self._has_events:
+            info["final_time"] = self.time.copy()
+        if self.problem.scores:
+            info["draw"] = self.draw.copy()
+        return info
 
     def _snapshot(self):
-        return self.t * self.problem.dt, self.u[:, None], np.column_stack(self.x)
+        controls = self.u if self.u.ndim == 2 else self.u[:, None]
+        return self.time.copy(), controls, np.column_stack(self.x)
 
     def _make_sheet(self):
         # Matplotlib takes a quarter of a second that only a picture should cost
-        from phased.animation import PhasePlane
+        from phased.animation import sheet_of
 
-        return PhasePlane(self.problem)
+        return sheet_of(self.problem)
+
+
+def end_of_phase(problem: Problem, phase: Phase, x, p):
+    """Terminal cost (n,), distance to the target (n,) and the radius that it must not exceed, of states x at the end.
+
+    The distance is in radii where each state has its own.
+    """
+    d = problem.distances(phase, x)
+    distance = np.hypot.reduce(np.array(d), axis=0) if d else np.zeros_like(x[0])
+    cost = phase.Qf * distance**2
+    if phase.terminal is not None:
+        cost = cost + problem.with_parameters(phase.terminal, p)(x)
+    return cost, problem.circle_distance(phase, x), phase.circle_radius
+
+
+def slope_along(event: Callable, x, dx) -> np.ndarray:
+    """The change of event(x) for each second along the derivatives dx, by a difference."""
+    small = 1e-6
+    ahead = event(tuple(xi + small * di for xi, di in zip(x, dx)))
+    return (ahead - event(x)) / small
 
 
 class PhasedEnv(SingleEnv):
@@ -186,22 +420,50 @@ def make_phased(env_id: str, **options) -> PhasedEnv:
     return PhasedEnv(make_phased_vector(env_id, **options)).sealed()
 
 
-def fly(env_id: str, policy: Callable, x0, **options) -> dict:
-    """Fly `policy(obs (n, obs), t) -> action (n, 1)` from each start x0 (n, 2) and record what happened.
+def register_problem(problem: Problem):
+    """Make a table known to `gymnasium.make`, to the scripts and to `baselines.py`, under its `env_id`.
 
-    Returns x (n, T+1, 2), the applied (clipped) u (n, T), reward (n, T), and the arrays of `final_info`.
+    Raises BadInput where the id is taken.
+    """
+    taken = problem.env_id in PROBLEMS or problem.env_id in gym.registry
+    refuse_unless(not taken, "env_id", repr(problem.env_id), "is taken already; it must be an id of its own")
+    PROBLEMS[problem.env_id] = problem
+    gym.register(
+        id=problem.env_id,
+        entry_point="envs:make_phased",
+        vector_entry_point="envs:make_phased_vector",
+        kwargs={"env_id": problem.env_id},
+    )
+
+
+def fly(env_id: str, policy: Callable, x0, draw=None, **options) -> dict:
+    """Fly `policy(obs (n, obs), t) -> action (n, m)` from each start x0 (n, states) and record what happened.
+
+    draw (n, k) are the standard scores of a table with some. Returns x (n, T+1, states), the applied (clipped) u
+    (n, T), or (n, T, m) where the table has a tuple of controls, reward (n, T), and the arrays of `final_info`. Behind
+    an episode's end x and u are NaN, and rewards 0.
     """
     batch: Any = gym.make_vec(env_id, num_envs=len(x0), **options)  # a PhasedVectorEnv
-    problem = PROBLEMS[env_id]
-    x = np.empty((len(x0), problem.steps + 1, 2))
-    u, reward = np.empty((2, len(x0), problem.steps))
-    obs, _ = batch.reset(options={"x0": x0})
-    for t in range(problem.steps):
-        x[:, t] = np.column_stack(batch.x)  # not of obs: the velocity may be hidden there
-        obs, reward[:, t], _, final = batch.advance(policy(obs, t))
-        u[:, t] = batch.u
-    x[:, -1] = np.column_stack(batch.x)
-    return {"x": x, "u": u, "reward": reward, **final}
+    problem = batch.problem
+    n, T = len(x0), problem.steps
+    x = np.full((n, T + 1, problem.states), np.nan)
+    u, reward = np.full((T, *batch.u.shape), np.nan), np.zeros((n, T))
+    final_info = {}
+    alive = np.ones(n, dtype=bool)
+    has_draw = problem.scores and draw is not None
+    obs, _ = batch.reset(options={"x0": x0, "draw": draw} if has_draw else {"x0": x0})
+    x[:, 0] = np.column_stack(batch.x)  # not of obs: the velocity may be hidden there
+    for t in range(T):
+        obs, rewards, ended, final = batch.advance(policy(obs, t))
+        x[alive, t + 1] = np.column_stack(batch.x)[alive]
+        u[t, alive] = batch.u[alive]
+        reward[alive, t] = rewards[alive]
+        for key, value in final.items():
+            final_info.setdefault(key, value.copy())[alive & ended] = value[alive & ended]
+        alive &= ~ended
+        if not alive.any():
+            break
+    return {"x": x, "u": np.moveaxis(u, 0, 1), "reward": reward, **final_info}
 
 
 make_phased.metadata = RENDERED  # where gym.make looks before there is an environment

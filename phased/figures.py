@@ -6,20 +6,23 @@ import numpy as np
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Circle
+from matplotlib.patches import Circle, Ellipse
 from matplotlib.ticker import LogLocator, NullFormatter
 
+from drawing.animation import SIDES, Flight
 from drawing.style import BOUNDARY, OPTIMUM, POLICY, SHOWN, TARGET
-from phased.metrics import NEAR_ORIGIN, comparable, cost_parts
-from phased.problem import Problem
+from phased.metrics import NEAR_ORIGIN, comparable, cost_parts, cost_ratio
+from phased.problem import Phase, Problem
 
 
 def trajectories_figure(problem: Problem, arrays: dict, title: str) -> Figure:
     """Phase plane, position, velocity and control of the first ten starts, with targets and the phases' ends.
 
-    `arrays` are those of eval.npz, here and below.
+    Of more states or controls each over time. `arrays` are those of eval.npz, here and below.
     """
-    t = arrays["t"]
+    if problem.states != 2 or problem.controls != 1 or problem.has_events:
+        return time_figure(problem, arrays, title)
+    t, (position_name, velocity_name) = arrays["t"], problem.state_labels
     figure = Figure(figsize=(11, 8.5), layout="constrained")
     (plane, position), (velocity, control) = figure.subplots(2, 2)
     for suffix, style in (("", POLICY), ("_reference", OPTIMUM)):
@@ -33,13 +36,17 @@ def trajectories_figure(problem: Problem, arrays: dict, title: str) -> Figure:
     for end in problem.phase_ends[:-1]:
         for ax in (position, velocity, control):
             ax.axvline(t[end], **BOUNDARY)
-    for bound in (-problem.u_max, problem.u_max):
+    low, high = problem.u_box[:, 0]
+    for bound in (low, high):
         control.axhline(bound, **{**BOUNDARY, "linestyle": "--"})
-    plane.set(xlabel="position $x_1$", ylabel="velocity $x_2$", title="Phase plane")
+    for ax, limits in zip((position, velocity), problem.limits.T):
+        mark_limits(ax, limits)
+    plane.set(xlabel=position_name, ylabel=velocity_name, title="Phase plane")
     plane.axis("equal")
-    position.set(xlabel="time (s)", ylabel="position $x_1$", title="Position")
-    velocity.set(xlabel="time (s)", ylabel="velocity $x_2$", title="Velocity")
-    control.set(xlabel="time (s)", ylabel="control $u$", title=f"Control (bounds ±{problem.u_max})")
+    position.set(xlabel="time (s)", ylabel=position_name, title="Position")
+    velocity.set(xlabel="time (s)", ylabel=velocity_name, title="Velocity")
+    bounds = f"±{high}" if low == -high else f"{low:g} to {high:g}"
+    control.set(xlabel="time (s)", ylabel=problem.control_labels[0], title=f"Control (bounds {bounds})")
     for ax in figure.axes:
         ax.grid(alpha=0.3)
     figure.suptitle(f"{title}\nthe first {len(arrays['x'][:SHOWN])} starts")
@@ -47,18 +54,95 @@ def trajectories_figure(problem: Problem, arrays: dict, title: str) -> Figure:
     return figure
 
 
+def time_figure(problem: Problem, arrays: dict, title: str) -> Figure:
+    """Each state and each control of the first ten starts over time, with targets, bounds and the phases' ends."""
+    labels = [*problem.state_labels, *problem.control_labels]
+    columns = min(3, len(labels))
+    rows = -(-len(labels) // columns)
+    figure = Figure(figsize=(4.2 * columns, 2.9 * rows + 1.0), layout="constrained")
+    panels = np.atleast_1d(figure.subplots(rows, columns)).ravel()
+    for suffix, style in (("", POLICY), ("_reference", OPTIMUM)):
+        for flight in flights_of(problem, arrays, suffix):
+            for k in range(problem.states):
+                panels[k].plot(flight.t, flight.y[:, k], **style)
+            for k in range(problem.controls):
+                panels[problem.states + k].stairs(flight.u[:, k], flight.t, baseline=None, **style)
+    for ax, label in zip(panels, labels):
+        ax.set(xlabel="time (s)", ylabel=label)
+        ax.grid(alpha=0.3)
+    for ax in panels[len(labels) :]:
+        ax.set_axis_off()
+    mark_table(problem, panels)
+    figure.suptitle(f"{title}\nthe first {len(arrays['x'][:SHOWN])} starts")
+    handles = [Line2D([], [], **POLICY, label="policy"), Line2D([], [], **OPTIMUM, label="optimum")]
+    handles.append(Line2D([], [], **TARGET, linestyle="--", label="target"))
+    handles.append(Line2D([], [], **BOUNDARY, label="bound, or end of a phase"))
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
+    return figure
+
+
+def flights_of(problem: Problem, arrays: dict, suffix: str) -> list[Flight]:
+    """The first flights of one side, each up to its end."""
+    flights = []
+    for k, (x, u) in enumerate(zip(arrays[f"x{suffix}"][:SHOWN], arrays[f"u{suffix}"][:SHOWN])):
+        steps = int(np.isfinite(x).all(axis=1).sum()) - 1
+        t = arrays["t"][: steps + 1].copy()
+        if problem.has_events:
+            t[-1] = arrays[f"final_time{suffix}"][k]
+        u = u.reshape(len(u), problem.controls)
+        flights.append(Flight.of(t, u[:steps], x[: steps + 1], SIDES[suffix]))
+    return flights
+
+
+def mark_table(problem: Problem, panels):
+    """Targets and bounds of each state, the set of controls, and the ends of phases of fixed time."""
+    start = 0.0
+    for phase in problem.phases:
+        end = start + phase.steps * problem.dt
+        for ax, target in zip(panels, problem.targets_of(phase)):
+            if target is not None:
+                ax.plot([start, end], [target, target], linestyle="--", zorder=3, **TARGET)
+        start = end
+    for ax, limits in zip(panels, [*problem.limits.T, *problem.u_box.T]):
+        mark_limits(ax, limits)
+    if not problem.has_events:
+        for end in problem.phase_ends[:-1]:
+            for ax in panels:
+                ax.axvline(end * problem.dt, **BOUNDARY)
+
+
+def mark_limits(ax, limits):
+    """Dashed lines at the finite ones of two bounds."""
+    for limit in limits:
+        if np.isfinite(limit):
+            ax.axhline(limit, **{**BOUNDARY, "linestyle": "--"})
+
+
 def mark_targets(problem: Problem, plane, position, velocity):
     """Green: each phase's target circle in the phase plane, and its target as a dashed line over the phase's time."""
     start = 0.0
     for k, phase in enumerate(problem.phases, start=1):
-        plane.add_patch(Circle(phase.target, phase.radius, fill=False, zorder=3, **TARGET))
-        if problem.waypoints:
+        add_circle(problem, phase, plane)
+        if problem.waypoints and None not in problem.targets_of(phase):
             offset = (-3, -16) if k == 1 else (-10, 5)  # points: the paths come in from the other sides
             plane.annotate(f"{k}", phase.target, offset, textcoords="offset points", color="tab:green", weight="bold")
         end = start + phase.steps * problem.dt
-        for ax, value in zip((position, velocity), phase.target):
-            ax.plot([start, end], [value, value], linestyle="--", zorder=3, **TARGET)
+        for ax, value in zip((position, velocity), problem.targets_of(phase)):
+            if value is not None:
+                ax.plot([start, end], [value, value], linestyle="--", zorder=3, **TARGET)
         start = end
+
+
+def add_circle(problem: Problem, phase: Phase, plane, zorder: int = 3):
+    """A phase's circle (or ellipse) in the phase plane: the patch; None where there is none, or a state is free."""
+    target = problem.targets_of(phase)
+    if not phase.has_circle or None in target:
+        return None
+    look = {"fill": False, "zorder": zorder, **TARGET}
+    if isinstance(phase.radius, tuple):
+        width, height = (2 * radius for radius in phase.radius)
+        return plane.add_patch(Ellipse(target, width, height, **look))
+    return plane.add_patch(Circle(target, phase.radius, **look))
 
 
 def add_legend(figure: Figure, problem: Problem):
@@ -77,23 +161,27 @@ def add_legend(figure: Figure, problem: Problem):
 
 def costs_figure(problem: Problem, arrays: dict, title: str) -> Figure:
     """Total costs of all starts as a histogram; of the first ten their total with the ratio, and its three parts."""
-    ours, optimum = (cost_parts(problem, arrays[f"x{s}"], arrays[f"u{s}"]) for s in ("", "_reference"))
-    figure = Figure(figsize=(12, 7), layout="constrained")
-    panels = figure.subplot_mosaic([["all", "total", "total"], ["state", "control", "terminal"]])
+    has_parts = problem.weighted and not problem.has_events  # others are told in eval.json alone
+    rows = [["all", "total", "total"], *([["state", "control", "terminal"]] if has_parts else [])]
+    figure = Figure(figsize=(12, 3.5 * len(rows)), layout="constrained")
+    panels = figure.subplot_mosaic(rows)
     cost, reference_cost = arrays["cost"], arrays["cost_reference"]
     bins = np.histogram_bin_edges([cost, reference_cost], bins=min(40, max(5, len(cost) // 5)))
     panels["all"].hist(cost, bins, color="tab:red", alpha=0.45, label="policy")
     panels["all"].hist(reference_cost, bins, histtype="step", color="tab:blue", linewidth=1.4, label="optimum")
     panels["all"].set(xlabel="total cost J", ylabel="starts", title=f"All {len(cost)} starts")
     plot_bars(panels["total"], cost, reference_cost, "total cost J")
-    chosen = comparable(problem, arrays["x"], arrays["x_reference"])
+    chosen = comparable(problem, arrays["x"], arrays["x_reference"]) & (reference_cost != 0)
+    ratio = cost_ratio(cost, np.where(chosen, reference_cost, 1.0))
     for k in range(min(SHOWN, len(cost))):
-        text = f"{cost[k] / reference_cost[k]:.3f}" if chosen[k] else "miss"  # a missed circle forbids a ratio
+        text = f"{ratio[k]:.3f}" if chosen[k] else "miss"  # a missed circle forbids a ratio
         top = k + 1, max(cost[k], reference_cost[k])
         panels["total"].annotate(text, top, (0, 3), textcoords="offset points", ha="center", fontsize=9)
     panels["total"].margins(y=0.12)
     panels["total"].set_title("The first starts, with the ratio policy / optimum")
-    for part, name in enumerate(("state", "control", "terminal")):
+    if has_parts:
+        ours, optimum = (cost_parts(problem, arrays[f"x{s}"], arrays[f"u{s}"]) for s in ("", "_reference"))
+    for part, name in enumerate(("state", "control", "terminal") if has_parts else ()):
         plot_bars(panels[name], ours[:, part], optimum[:, part], f"{name} cost")
     panels["all"].legend()
     figure.suptitle(title)
@@ -127,9 +215,10 @@ def cost_error_figure(problem: Problem, arrays: dict, title: str) -> Figure:
     dots = box.scatter(*x0[order].T, c=loss[order], **style)
     figure.colorbar(dots, ax=box, label="loss $J - J^*$", extend="both")
     box.add_patch(Circle((0, 0), NEAR_ORIGIN, fill=False))
-    edge = 1.05 * problem.x0_max
+    edge = 1.05 * np.max(np.abs(x0))
     box.set(xlim=(-edge, edge), ylim=(-edge, edge), aspect="equal", title=f"Loss of {len(x0)} starts")
-    box.set(xlabel="position $x_1$ of the start", ylabel="velocity $x_2$ of the start")
+    position, velocity = problem.state_labels
+    box.set(xlabel=f"{position} of the start", ylabel=f"{velocity} of the start")
     over_distance.loglog(distance, best, "x", color="tab:blue", markersize=4, alpha=0.6, label="optimum $J^*$")
     over_distance.loglog(distance, loss, ".", color="tab:red", alpha=0.5, label="loss of the policy $J - J^*$")
     label = f"$|x_0| = {NEAR_ORIGIN}$, the circle on the left"

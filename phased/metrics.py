@@ -13,14 +13,17 @@ PAPER_STARTS, PAPER_DRAWS = 10, 100  # the paper reports the mean ratio of ten s
 NEAR_ORIGIN = 0.2  # |x0| within which J* is so small that the ratio says little and the loss J - J* says more
 
 
-def flight_metrics(flight: dict, reference: dict) -> dict:
+def flight_metrics(problem: Problem, flight: dict, reference: dict) -> dict:
     """Means over all starts of what was flown and of the optimum, and the shares of starts that hit their circles."""
     metrics = {}
+    parts = ("cost", *(f"cost_{part}" for part in problem.parts))
     for prefix, result in (("", flight), ("reference_", reference)):
         metrics[f"{prefix}episodic_return"] = float(result["episodic_return"].mean())
-        for part in ("cost", "cost_state", "cost_control", "cost_terminal"):
+        for part in parts:
             metrics[f"{prefix}{part}_mean"] = float(result[part].mean())
         metrics[f"{prefix}hit_rate"] = float(result["hit"].all(axis=1).mean())
+        if problem.has_events:
+            metrics[f"{prefix}final_time_mean"] = float(result["final_time"].mean())
     for k, rate in enumerate(flight["hit"].mean(axis=0), start=1):
         metrics[f"hit_rate_phase_{k}"] = float(rate)
     metrics["terminal_error_max"] = float(flight["terminal_error"].max())
@@ -28,21 +31,28 @@ def flight_metrics(flight: dict, reference: dict) -> dict:
 
 
 def hits_every_circle(problem: Problem, x: np.ndarray) -> np.ndarray:
-    """Whether flights x (n, T+1, 2) are within the target's radius at the end of every phase; (n,) bool."""
-    phases = problem.phases
-    d: np.ndarray = x[:, problem.phase_ends] - [phase.target for phase in phases]  # (n, phases, 2)
-    # hypot, as in the environment: the optimum is on the circle's edge, where another rounding would decide otherwise
-    distance: np.ndarray = np.hypot(d[..., 0], d[..., 1])
-    return np.all(distance <= [phase.radius for phase in phases], axis=1)
+    """Whether flights x (n, T+1, states) are in the target's circle at the end of every phase; (n,) bool.
+
+    Of a problem with events only for one phase, whose end is the last state that is finite.
+    """
+    hits = np.ones(len(x), dtype=bool)
+    last = np.isfinite(x).all(axis=2).sum(axis=1) - 1
+    for phase, end in zip(problem.phases, problem.phase_ends):
+        step = last if problem.has_events else np.full(len(x), end)
+        # in the environment's words: the optimum is on the circle's edge, where another rounding would decide otherwise
+        state = tuple(x[np.arange(len(x)), step].T)
+        error = problem.circle_distance(phase, state)
+        hits &= error <= phase.circle_radius
+    return hits
 
 
 def comparable(problem: Problem, x: np.ndarray, x_reference: np.ndarray) -> np.ndarray:
-    """The starts (n,) whose costs may be compared: all, or with waypoints those where both sides hit every circle.
+    """The starts (n,) whose costs may be compared: all, or where circles count those where both sides hit them all.
 
     Skipping a circle is cheaper than hitting it, so that a miss would count as better than the optimum. An optimum that
     hits every circle is the radius-constrained one, also where the constraint did not have to be imposed.
     """
-    if not problem.waypoints:
+    if not problem.circles_count:
         return np.ones(len(x), dtype=bool)
     return hits_every_circle(problem, x) & hits_every_circle(problem, x_reference)
 
@@ -51,11 +61,15 @@ def ratio_metrics(cost: np.ndarray, reference_cost: np.ndarray, eval_seed: int) 
     """Statistics of the cost ratios ours / optimum of the comparable starts, both (m,); without a start, no key.
 
     The paper's number is the mean of ten ratios: `ratio_mean` is its expectation, the draws of ten are its spread.
+    Where the optimum's cost is below 0 (a gain) the ratio is 1 + loss / |gain|: above 1 is worse, as everywhere. A
+    start whose optimum costs nothing has none.
     """
-    if len(cost) == 0:
+    has_ratio = reference_cost != 0
+    cost, reference_cost = cost[has_ratio], reference_cost[has_ratio]
+    if len(cost) == 0 or reference_cost.sum() == 0:
         return {}
-    ratio = cost / reference_cost
-    metrics = {"ratio_of_sums": cost.sum() / reference_cost.sum(), "ratio_mean": ratio.mean()}
+    ratio = cost_ratio(cost, reference_cost)
+    metrics = {"ratio_of_sums": cost_ratio(cost.sum(), reference_cost.sum()), "ratio_mean": ratio.mean()}
     metrics |= {"ratio_median": np.median(ratio), "ratio_p95": np.percentile(ratio, 95)}
     metrics |= {"ratio_min": ratio.min(), "ratio_max": ratio.max()}
     if len(ratio) >= PAPER_STARTS:
@@ -66,9 +80,15 @@ def ratio_metrics(cost: np.ndarray, reference_cost: np.ndarray, eval_seed: int) 
     return {key: float(value) for key, value in metrics.items()}
 
 
+def cost_ratio(cost, reference_cost):
+    """cost / reference_cost, or where that is below 0 one plus the loss in units of the gain."""
+    return np.where(reference_cost > 0, cost / reference_cost, 1 + (cost - reference_cost) / np.abs(reference_cost))
+
+
 def ends_at_origin(problem: Problem) -> bool:
-    """Whether its only target is the origin, where the optimal cost of a start vanishes."""
-    return not problem.waypoints and not any(problem.phases[0].target)
+    """Whether its only target is the origin of two states, where the optimal cost of a start vanishes."""
+    (phase, *others) = problem.phases
+    return problem.states == 2 and problem.weighted and not others and phase.target == (0.0, 0.0)
 
 
 def near_origin_metrics(problem: Problem, x0: np.ndarray, cost: np.ndarray, reference_cost: np.ndarray) -> dict:
@@ -77,8 +97,10 @@ def near_origin_metrics(problem: Problem, x0: np.ndarray, cost: np.ndarray, refe
     There J* vanishes with |x0|^2, so that a loss c makes a start's ratio 1 + c / J* as large as one likes, and a few
     such starts make the mean ratio of all. With waypoints J* does not vanish: the second is not at the origin.
     """
+    if not ends_at_origin(problem):
+        return {}
     near = np.hypot(*x0.T) <= NEAR_ORIGIN
-    if not ends_at_origin(problem) or not near.any():
+    if not near.any():
         return {}
     return {"loss_near_origin_mean": float((cost - reference_cost)[near].mean())}
 
@@ -86,13 +108,17 @@ def near_origin_metrics(problem: Problem, x0: np.ndarray, cost: np.ndarray, refe
 def cost_parts(problem: Problem, x: np.ndarray, u: np.ndarray) -> np.ndarray:
     """State, control and terminal part (n, 3) of the cost J of flights x (n, T+1, 2), u (n, T) (the paper's Eq. of J).
 
-    eval.npz holds the flights and their total cost; the figures take its parts from here.
+    eval.npz holds the flights and their total cost; the figures take its parts from here. Of costs by weights, without
+    events: those of functions are told in eval.json alone.
     """
+    u = u.reshape(len(u), -1, problem.controls)
     parts, start = np.zeros((len(x), 3)), 0
     for phase in problem.phases:
-        d = x[:, start : start + phase.steps + 1] - phase.target
-        parts[:, 0] += (d[:, :-1] ** 2 @ phase.Q).sum(axis=1)  # the state before each step
-        parts[:, 1] += phase.R * (u[:, start : start + phase.steps] ** 2).sum(axis=1)
+        aimed = np.array([target is not None for target in problem.targets_of(phase)])
+        target = np.array([target or 0.0 for target in problem.targets_of(phase)])
+        d = (x[:, start : start + phase.steps + 1] - target) * aimed
+        parts[:, 0] += (d[:, :-1] ** 2 @ np.array(problem.state_weights(phase))).sum(axis=1)  # before each step
+        parts[:, 1] += (u[:, start : start + phase.steps] ** 2 @ np.array(problem.control_weights(phase))).sum(axis=1)
         parts[:, 2] += phase.Qf * (d[:, -1] ** 2).sum(axis=1)
         start += phase.steps
     return parts

@@ -1,11 +1,22 @@
-"""The table of a small problem: dynamics, bounds and phases, as in the paper's tables of simulation parameters."""
+"""The table of a small problem: dynamics, controls, starts and phases. A problem of your own is such a table.
+
+Not for a table: states that jump between phases, parameters that the optimum may choose, costs with explicit time (make
+the clock a state), and final times that are chosen without an event.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+
+from common.errors import refuse_unless
+from common.integration import rk4
+from phased.checks import check_problem
+
+LARGEST_SCORE = 3.0  # standard scores are drawn within +-3
 
 
 def lists_to_tuples(table):
@@ -17,43 +28,97 @@ def lists_to_tuples(table):
 
 @dataclass(frozen=True)
 class Phase:
-    """One column of a parameter table. Matrices are diagonal: Q = diag(Q), Q_f = Qf I_2 (printed for one column)."""
+    """One column of a parameter table: how long, what it costs, and where it should end.
 
-    steps: int  # duration / dt
-    target: tuple[float, float]  # position and velocity; by our reading passed through at the phase's end, not held
-    radius: float  # r_target: within it the bonus is paid
-    R: float  # control cost
-    Qf: float  # terminal cost
-    bonus: float  # terminal bonus B
-    Q: tuple[float, float] = (1.0, 1.0)  # state cost
+    The cost is by weights, as the paper's, or by functions, or both:
+
+    - weights, about the target's distance d: d'Q d + R u^2, summed over the steps, and Qf |d|^2 at the phase's end
+    - `running(x, u)`, integrated over the phase's time, and `terminal(x)` at its end
+
+    Every function of a table takes x as a tuple of states. With hidden parameters it takes them, too, as its last
+    argument, a tuple: f(x, u, p), running(x, u, p), terminal(x, p), end(x, p).
+    """
+
+    steps: int  # duration / dt; with `end` the longest
+    target: tuple[float | None, ...] | None = None  # of each state, at the phase's end; None: free
+    radius: float | tuple[float, ...] = math.inf  # r_target; a tuple: of each state with a target, an ellipse's axes
+    R: float | tuple[float, ...] = 0.0  # weight of the control, or of each
+    Qf: float = 0.0  # weight of |d|^2 at the end
+    bonus: float = 0.0  # terminal bonus B, paid within the radius
+    Q: tuple[float, ...] | None = None  # weight of each state; left out 1, with `running` or `terminal` 0
+    running: Callable | None = None  # cost for each second
+    terminal: Callable | None = None  # cost at the end
+    end: Callable | None = None  # the phase ends at the moment when end(x) falls through 0
+    f: Callable | None = None  # dynamics of this phase; None: the problem's
 
     def __post_init__(self):
         lists_to_tuples(self)
+        if self.Q is None and isinstance(self.target, tuple):
+            object.__setattr__(self, "Q", (1.0 if self.weighted else 0.0,) * len(self.target))
+
+    @property
+    def weighted(self) -> bool:
+        """Whether its cost is the paper's: weights alone."""
+        return self.running is None and self.terminal is None and self.target is not None
+
+    @property
+    def has_circle(self) -> bool:
+        """Whether its end may hit or miss."""
+        return self.radius != math.inf
+
+    @property
+    def circle_radius(self) -> float:
+        """What `Problem.circle_distance` must not exceed: the radius, or 1 where the distance is in radii."""
+        return 1.0 if isinstance(self.radius, tuple) else self.radius
 
 
 @dataclass(frozen=True)
 class Problem:
-    """A parameter table: dynamics, control bound, phases; `x_max` (ours) bounds every state reachable from the box.
+    """A parameter table. It has n states and m controls: as many as `x_max` and `u_max` have numbers.
+
+    With one number as `u_max` the control is a bare number u, with a tuple it is a tuple. The set of controls is the
+    box from `u_min` (-u_max) to `u_max`, or with `u_norm` all vectors from a least to a greatest norm.
+
+    An episode begins in the box `x0` +- `x0_max`. With `scores` k it draws k standard scores z, clipped at +-3, before.
+    `x0` may then be a function of z, a tuple of k arrays, and `parameters(z)` gives the hidden parameters p.
+
+    `bounds` are constraints in the optimum. The environment charges `bound_price` for each second at a distance of one
+    `x_scale` beyond them.
 
     `single_optimum` is a promise that IPOPT ends in the same optimum from every guess, so that the reference tries one
     (see `baselines.guesses`): left out, a new problem's reference is the best of several.
     """
 
     env_id: str
-    f: Callable
-    u_max: float
+    f: Callable  # x' = f(x, u), a tuple of n derivatives
+    u_max: float | tuple[float, ...]
     phases: tuple[Phase, ...]
-    x_max: tuple[float, float]
-    dt: float = 0.1  # s
-    x0_max: float = 1.0  # the table's "state bounds", by our reading the box of the initial states, never a constraint
+    x_max: tuple[float, ...]  # a bound of every reachable |state| (the observation's box), never a constraint
+    dt: float = 0.1  # s, of a step: a control is held for it
+    x0_max: float | tuple[float, ...] = 1.0  # the table's "state bounds", by our reading the box of the initial states
     single_optimum: bool = False
+    guess: Callable | None = None  # u = guess(x), a feedback law whose flight is one more guess at the optimum
+    u_min: float | tuple[float, ...] | None = None  # None: -u_max
+    u_norm: tuple[float, float] | None = None  # least and greatest norm of the control vector
+    u_scale: float | None = None  # an action of 1 with `scaled_action`; None: half the width of the set of controls
+    x0: tuple[float, ...] | Callable | None = None  # centre of the box, None: the origin; or a function of z
+    scores: int = 0  # number of standard scores z
+    parameters: Callable | None = None  # hidden parameters of z
+    bounds: tuple[tuple[float | None, float | None] | None, ...] | None = None  # least and greatest of each state
+    bound_price: float = 0.0
+    x_scale: tuple[float, ...] | None = None  # a usual size of each state; None: 1
+    velocities: tuple[int, ...] | None = None  # the states that `observe_velocity=False` hides; None: of two the second
+    substeps: int = 1  # Runge-Kutta steps in a step
+    x_names: tuple[str, ...] | None = None
+    u_names: tuple[str, ...] | None = None
 
     def __post_init__(self):
         lists_to_tuples(self)
+        check_problem(self)
 
     @property
     def steps(self) -> int:
-        """Number of steps T of an episode."""
+        """Number of steps T of an episode, with events of the longest."""
         return sum(phase.steps for phase in self.phases)
 
     @property
@@ -66,13 +131,207 @@ class Problem:
         """The step with which each phase ends, (phases,)."""
         return np.cumsum([phase.steps for phase in self.phases])
 
+    @property
+    def states(self) -> int:
+        """Their number n."""
+        return len(self.x_max)
 
-PROBLEMS: dict[str, Problem] = {}  # by environment id; `envs.py` fills it
+    @property
+    def controls(self) -> int:
+        """Their number m."""
+        return len(self.u_max) if isinstance(self.u_max, tuple) else 1
+
+    @property
+    def weighted(self) -> bool:
+        """Whether all its cost is by weights, as the paper's."""
+        return all(phase.weighted for phase in self.phases)
+
+    @property
+    def has_events(self) -> bool:
+        """Whether a phase may end before its last step."""
+        return any(phase.end is not None for phase in self.phases)
+
+    @property
+    def has_one_flight(self) -> bool:
+        """Whether all episodes begin alike."""
+        return not self.scores and not np.any(self.x0_max)
+
+    @property
+    def circles_count(self) -> bool:
+        """Whether the optimum has to end in the circles: not with one phase by weights, where its J alone counts."""
+        return any(phase.has_circle for phase in self.phases) and (self.waypoints or not self.weighted)
+
+    @property
+    def u_box(self) -> np.ndarray:
+        """Least and greatest of each control, (2, m)."""
+        high = np.atleast_1d(self.u_max).astype(float)
+        low = -high if self.u_min is None else np.atleast_1d(self.u_min).astype(float)
+        return np.array([low, high])
+
+    @property
+    def u_centre(self) -> np.ndarray:
+        """The middle of the set of controls, (m,)."""
+        return self.u_box.mean(axis=0)
+
+    @property
+    def u_unit(self) -> np.ndarray:
+        """What an action of 1 adds to the middle, (m,): `u_scale`, or half the width."""
+        low, high = self.u_box
+        return (high - low) / 2 if self.u_scale is None else np.full(self.controls, self.u_scale)
+
+    @property
+    def scale(self) -> np.ndarray:
+        """A usual size of each state, (n,)."""
+        return np.ones(self.states) if self.x_scale is None else np.array(self.x_scale, dtype=float)
+
+    @property
+    def limits(self) -> np.ndarray:
+        """Least and greatest allowed value of each state, (2, n), infinite where it is free."""
+        rows = [(None, None) if row is None else row for row in self.bounds or [None] * self.states]
+        low = [-math.inf if least is None else least for least, _ in rows]
+        high = [math.inf if greatest is None else greatest for _, greatest in rows]
+        return np.array([low, high])
+
+    @property
+    def hidden_velocities(self) -> tuple[int, ...]:
+        """The states that are velocities."""
+        if self.velocities is not None:
+            return self.velocities
+        return (1,) if self.states == 2 else ()
+
+    @property
+    def state_labels(self) -> list[str]:
+        """A name for each state, for figures and tables."""
+        if self.x_names is not None:
+            return list(self.x_names)
+        if self.states == 2:
+            return ["position $x_1$", "velocity $x_2$"]
+        return [f"$x_{{{k}}}$" for k in range(1, self.states + 1)]
+
+    @property
+    def control_labels(self) -> list[str]:
+        """A name for each control."""
+        if self.u_names is not None:
+            return list(self.u_names)
+        return ["control $u$"] if self.controls == 1 else [f"control $u_{{{k}}}$" for k in range(1, self.controls + 1)]
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """What the cost is the sum of."""
+        weights = ("state", "control") if any(phase.weighted or phase.R for phase in self.phases) else ()
+        running = ("running",) if any(phase.running for phase in self.phases) else ()
+        return (*weights, *running, "terminal", *(("bounds",) if self.bounds else ()))
+
+    def targets_of(self, phase: Phase) -> tuple[float | None, ...]:
+        """The target of each state, None where it is free."""
+        return (None,) * self.states if phase.target is None else phase.target
+
+    def state_weights(self, phase: Phase) -> tuple[float, ...]:
+        """Q of each state; 0 where it has no target."""
+        if phase.target is None:
+            return (0.0,) * self.states
+        return tuple(0.0 if target is None else weight for weight, target in zip(phase.Q, phase.target))
+
+    def control_weights(self, phase: Phase) -> tuple[float, ...]:
+        """R of each control."""
+        return phase.R if isinstance(phase.R, tuple) else (phase.R,) * self.controls
+
+    def distances(self, phase: Phase, x) -> list:
+        """The distance to its target of each state that has one."""
+        return [xi - target for xi, target in zip(x, self.targets_of(phase)) if target is not None]
+
+    def radii(self, phase: Phase) -> tuple[float, ...]:
+        """The radius in each state that has a target."""
+        count = sum(target is not None for target in self.targets_of(phase))
+        return phase.radius if isinstance(phase.radius, tuple) else (phase.radius,) * count
+
+    def circle_distance(self, phase: Phase, x) -> np.ndarray:
+        """The distance (n,) of states x, a tuple of arrays, to a phase's target; in radii where each has its own."""
+        d = self.distances(phase, x)
+        if not d:
+            return np.zeros_like(x[0])
+        if isinstance(phase.radius, tuple):
+            d = [di / r for di, r in zip(d, phase.radius)]
+        return np.hypot.reduce(np.array(d), axis=0)
+
+    def with_parameters(self, function: Callable, p) -> Callable:
+        """A function of the table as one that does not take the hidden parameters p."""
+        if self.parameters is None:
+            return function
+        return lambda *arguments: function(*arguments, p)
+
+    def step(self, phase: Phase, x, u, p, h) -> tuple:
+        """The states after h seconds, and the integral of `running` over them (0 without it): (x_next, cost).
+
+        x is a tuple of n arrays or symbols, u one or a tuple, p the hidden parameters.
+        """
+        f = self.with_parameters(phase.f or self.f, p)
+        h = h / self.substeps if self.substeps > 1 else h
+        if phase.running is None:
+            for _ in range(self.substeps):
+                x = rk4(f, x, u, h)
+            return x, 0.0
+        running = self.with_parameters(phase.running, p)
+        y = (*x, 0.0)  # the cost is one more state
+        for _ in range(self.substeps):
+            y = rk4(lambda y, u: (*f(y[:-1], u), running(y[:-1], u)), y, u, h)
+        return y[:-1], y[-1]
+
+    def as_control(self, u):
+        """Rows u (m, ...) as the table's functions take them: a bare one, or a tuple."""
+        return tuple(u) if isinstance(self.u_max, tuple) else u[0]
+
+    def starts_in_box(self, rng: np.random.Generator, n: int) -> np.ndarray:
+        """n starts (n, states) in the box of a table without a function for them."""
+        centre = np.zeros(self.states) if self.x0 is None else np.array(self.x0, dtype=float)
+        half = np.broadcast_to(np.asarray(self.x0_max, dtype=float), self.states)
+        return rng.uniform(centre - half, centre + half, (n, self.states))
+
+    def draw_scores(self, rng: np.random.Generator, n: int) -> np.ndarray:
+        """n draws (n, k) of the standard scores."""
+        return np.clip(rng.standard_normal((n, self.scores)), -LARGEST_SCORE, LARGEST_SCORE)
+
+    def hidden(self, draw: np.ndarray) -> tuple:
+        """The hidden parameters of draws (n, k): a tuple of arrays (n,)."""
+        if self.parameters is None:
+            return ()
+        return tuple(np.broadcast_to(value, len(draw)).astype(float) for value in self.parameters(tuple(draw.T)))
 
 
-def starts(seed: int, n: int, x0_max: float = 1.0) -> np.ndarray:
+class Tables(dict[str, Problem]):
+    """Tables by environment id. Raises BadInput where another table of this id is there, or the id is not its own."""
+
+    def __setitem__(self, env_id: str, problem: Problem):
+        refuse_unless(env_id == problem.env_id, "the id", repr(env_id), f"must be the table's, {problem.env_id}")
+        taken = env_id in self and self[env_id] != problem
+        refuse_unless(not taken, "env_id", repr(env_id), "is taken already; it must be an id of its own")
+        super().__setitem__(env_id, problem)
+
+
+PROBLEMS = Tables()  # `register_problem` of `environment.py` fills it
+
+
+def starts(seed: int, n: int, x0_max: float | tuple[float, ...] = 1.0) -> np.ndarray:
     """The n starts (n, 2) of a seed, in evaluations and references: uniform in [-x0_max, x0_max] in each component.
 
-    `x0_max` is the problem's; 1 are the paper's "state bounds".
+    `x0_max` is the problem's, a number for each state or one for two; 1 are the paper's "state bounds".
     """
-    return np.random.default_rng(seed).uniform(-x0_max, x0_max, (n, 2))
+    bound = np.asarray(x0_max, dtype=float)
+    return np.random.default_rng(seed).uniform(-bound, bound, (n, bound.size if bound.ndim else 2))
+
+
+def uniform(z, low: float, high: float):
+    """A number between low and high, all alike likely, of a standard score z: for functions of scores in a table."""
+    from scipy.special import ndtr
+
+    return low + (high - low) * ndtr(z)
+
+
+def flights_of_seed(problem: Problem, seed: int, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """The n flights of a seed, in evaluations and references: their starts (n, states) and draws (n, k)."""
+    rng = np.random.default_rng(seed)
+    if callable(problem.x0):
+        draw = problem.draw_scores(rng, n)
+        return np.column_stack([np.broadcast_to(x, n) for x in problem.x0(tuple(draw.T))]).astype(float), draw
+    x0 = problem.starts_in_box(rng, n)
+    return x0, problem.draw_scores(rng, n)

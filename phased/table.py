@@ -22,15 +22,19 @@ def table(problem: Problem, metrics: dict) -> str:
 
 def cost_rows(problem: Problem, metrics: dict) -> list[tuple]:
     """The cost, its parts, and the reward: label, optimum, ours, ratio."""
-    all_compared = not problem.waypoints or metrics["hit_rate"] == metrics["reference_hit_rate"] == 1
-    parts = {"cost_state": "  of it: state", "cost_control": "  of it: control", "cost_terminal": "  of it: terminal"}
+    all_compared = not problem.circles_count or metrics["hit_rate"] == metrics["reference_hit_rate"] == 1
+    parts = {f"cost_{part}": f"  of it: {part}" for part in problem.parts}
     optimum, ours = metrics["reference_cost_mean"], metrics["cost_mean"]
     rows = [row(f"cost J (mean of {metrics['eval_starts']} starts)", optimum, ours, metrics.get("ratio_of_sums"))]
     for part, label in parts.items():
         optimum, ours = metrics[f"reference_{part}_mean"], metrics[f"{part}_mean"]
-        rows.append(row(label, optimum, ours, ours / optimum if all_compared and optimum else None))
+        ratio = ours / optimum if all_compared and optimum > 0 else None
+        rows.append(row(label, optimum, ours, ratio))
     optimum, ours = metrics["reference_episodic_return"], metrics["episodic_return"]
-    return [*rows, row("reward (bonus - J, mean)", optimum, ours, None)]
+    rows.append(row("reward (bonus - J, mean)", optimum, ours, None))
+    if problem.has_events:
+        rows.append(row("final time (s, mean)", metrics["reference_final_time_mean"], metrics["final_time_mean"], None))
+    return rows
 
 
 def row(label: str, optimum: float, ours: float, ratio: float | None) -> tuple:
@@ -40,10 +44,14 @@ def row(label: str, optimum: float, ours: float, ratio: float | None) -> tuple:
 
 def hit_rows(problem: Problem, metrics: dict) -> list[tuple]:
     """The shares of starts that hit their circles: label, optimum, ours, ratio."""
+    if not any(phase.has_circle for phase in problem.phases):
+        return []
     label = "starts that hit every circle" if problem.waypoints else "starts that hit the target circle"
     rows = [(label, f"{metrics['reference_hit_rate']:.1%}", f"{metrics['hit_rate']:.1%}", "-")]
     if problem.waypoints:
         for k, phase in enumerate(problem.phases, start=1):
+            if not phase.has_circle:
+                continue
             label = f"  circle {k}: {phase.target}, radius {phase.radius}"
             rows.append((label, "", f"{metrics[f'hit_rate_phase_{k}']:.1%}", ""))
     return rows
@@ -52,9 +60,11 @@ def hit_rows(problem: Problem, metrics: dict) -> list[tuple]:
 def ratio_lines(problem: Problem, metrics: dict) -> list[str]:
     """The lines below the table: the statistics of the cost ratio, or why there is none."""
     if "ratio_of_sums" not in metrics:
+        if not problem.circles_count:
+            return ["  No cost ratio: the optimum costs nothing."]
         reason = "no start hit every circle" if metrics["hit_rate"] == 0 else "where ours hit, the optimum does not"
         return [f"  No cost ratio: {reason} (missing a circle is cheaper, not better)."]
-    over = "the starts that hit every circle" if problem.waypoints else f"all {metrics['eval_starts']} starts"
+    over = "the starts that hit every circle" if problem.circles_count else f"all {metrics['eval_starts']} starts"
     lines = [f"  Cost ratio ours / optimum over {over}:"]
     lines.append(f"    mean {metrics['ratio_mean']:.4f}: the paper's statistic, a mean of ten starts, on average")
     draws = {key: metrics.get(f"ten_start_ratio_mean_{key}") for key in ("p05", "p50", "p95")}

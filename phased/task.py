@@ -10,8 +10,8 @@ import numpy as np
 from common.command_line import integer
 from common.errors import BadInput
 from phased.environment import fly
-from phased.metrics import comparable, flight_metrics, near_origin_metrics, ratio_metrics
-from phased.problem import Problem, starts
+from phased.metrics import flight_metrics, near_origin_metrics, ratio_metrics
+from phased.problem import Problem, flights_of_seed
 from phased.table import table
 
 KEPT_STARTS = 100  # in a results folder
@@ -32,25 +32,30 @@ class PhasedTask:
     # --- flying and measuring
 
     def reset_options(self, eval_seed: int, n: int, **env_options) -> dict:
-        return {"x0": starts(eval_seed, n, self.problem.x0_max)}
+        x0, draw = flights_of_seed(self.problem, eval_seed, n)
+        return {"x0": x0, "draw": draw} if self.problem.scores else {"x0": x0}
 
     def evaluate(self, policy, eval_seed: int, n: int, reference: dict | None = None, **env_options):
         """As `Task.evaluate`. Raises ValueError if the reference belongs to other starts."""
-        problem, x0 = self.problem, starts(eval_seed, n, self.problem.x0_max)
-        flight = fly(self.env_id, policy, x0, **env_options)
+        problem, (x0, draw) = self.problem, flights_of_seed(self.problem, eval_seed, n)
+        flight = fly(self.env_id, policy, x0, draw, **env_options)
         if reference is None:
             reference = self.optimum(eval_seed, n)
         if not np.array_equal(reference["x"][:, 0], x0):
             raise ValueError(f"reference does not belong to the {n} starts of eval_seed {eval_seed}")
-        compared = comparable(problem, flight["x"], reference["x"])
+        compared = flight["hit"].all(axis=1) & reference["hit"].all(axis=1) | (not problem.circles_count)
         costs = flight["cost"][compared], reference["cost"][compared]
         metrics = {"env_id": self.env_id, "eval_seed": eval_seed, "eval_starts": n}
-        metrics |= flight_metrics(flight, reference)
+        metrics |= flight_metrics(problem, flight, reference)
         metrics |= ratio_metrics(*costs, eval_seed)
         metrics |= near_origin_metrics(problem, x0[compared], *costs)
         arrays = {"t": problem.dt * np.arange(problem.steps + 1)}
         arrays |= {key: flight[key] for key in ("x", "u", "reward", "cost")}
         arrays |= {f"{key}_reference": reference[key] for key in ("x", "u", "cost")}
+        if problem.has_events:
+            arrays |= {"final_time": flight["final_time"], "final_time_reference": reference["final_time"]}
+        if problem.scores:
+            arrays["draw"] = draw
         return metrics, arrays
 
     def reported_metrics(self, metrics: dict, timed_policy=None, **env_options) -> dict:
@@ -59,6 +64,8 @@ class PhasedTask:
     # --- the size of an evaluation, and what a run may not do
 
     def default_flights(self, is_brief: bool, **env_options) -> int:
+        if self.problem.has_one_flight:
+            return 10
         return 50 if is_brief else 1000
 
     def interim_flights(self, n: int, **env_options) -> int:
@@ -93,7 +100,7 @@ class PhasedTask:
         if "ratio_of_sums" not in metrics:
             return f"{self.env_id}: no cost ratio, {metrics['hit_rate']:.1%} of the starts hit every circle"
         title = f"{self.env_id}: cost {metrics['ratio_of_sums']:.4f} x optimum"
-        if self.problem.waypoints:
+        if self.problem.circles_count:
             return f"{title} over the starts that hit every circle ({metrics['hit_rate']:.1%})"
         return f"{title} ({metrics['eval_starts']} starts)"
 
@@ -104,8 +111,10 @@ class PhasedTask:
         if curves:
             figures["training.png"] = self.training_figure(metrics, curves)
         figures["trajectories.png"] = trajectories_figure(problem, arrays, title)
+        if problem.has_one_flight:
+            return figures
         figures["costs.png"] = costs_figure(problem, arrays, title)
-        if not problem.waypoints:  # with them a missed circle would count as a gain
+        if problem.states == 2 and problem.weighted and not problem.waypoints:  # there a missed circle would be a gain
             figures["cost_error.png"] = cost_error_figure(problem, arrays, title)
         return figures
 
@@ -117,9 +126,9 @@ class PhasedTask:
         return training_figure(curves, self.headline(metrics), metrics["reference_episodic_return"], miss)
 
     def animation(self, arrays: dict, metrics: dict):
-        from phased.animation import phase_plane_animation
+        from phased.animation import problem_animation
 
-        return phase_plane_animation(self.problem, arrays, self.headline(metrics))
+        return problem_animation(self.problem, arrays, self.headline(metrics))
 
     # --- files
 

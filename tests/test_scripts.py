@@ -490,7 +490,8 @@ def test_eval_only_defaults(trained, tmp_path, monkeypatch):
     monkeypatch.setattr(PhasedTask, "evaluate", evaluate)
     monkeypatch.setattr(PhasedTask, "table", lambda task, metrics: "")
     DI.main(["--eval-only", f"--checkpoint={trained / 'agent.safetensors'}", "--embed-dim=8", "--eval-seed=7"])
-    assert asked == [("DoubleIntegrator-v0", 7, 1000, {"observe_phase": False, "observe_velocity": True})]
+    options = {"observe_phase": False, "observe_velocity": True, "scaled_action": True}
+    assert asked == [("DoubleIntegrator-v0", 7, 1000, options)]
     assert os.listdir() == []
 
 
@@ -531,7 +532,7 @@ def test_eval_every_uses_starts_of_its_own(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("eval_every", [0, 2])
 def test_the_reported_starts_have_an_optimum_before_anything_is_learned(tmp_path, monkeypatch, eval_every):
-    def refuse(env_id, x0):
+    def refuse(env_id, x0, draw):
         if np.array_equal(x0, baselines.starts(77, 10)):
             raise NoOptimum("start 3 has none")
         return reference(env_id, x0)

@@ -1,0 +1,139 @@
+"""What is asked of an id without an optimum: see `common.tasks.Task`. Its tables and figures leave the optimum out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.batch import make_batch
+from common.errors import BadInput
+
+KEPT_FLIGHTS = 100  # in a results folder
+SHOWN_FLIGHTS = 10  # in a figure
+
+
+@dataclass(frozen=True)
+class BatchedTask:
+    """An environment derived from `BatchedEnv`, measured over the episodes that a seed begins."""
+
+    env_id: str
+
+    def optimum(self, eval_seed: int, n: int, **env_options) -> dict:
+        return {}
+
+    # --- flying and measuring
+
+    def reset_options(self, eval_seed: int, n: int, **env_options) -> dict:
+        raise BadInput(f"env_id is {self.env_id!r}; it must be an id with an optimum: its starts have no table")
+
+    def evaluate(self, policy, eval_seed: int, n: int, reference: dict | None = None, **env_options):
+        """As `Task.evaluate`: the return, the length, and the mean of every number of `final_info`."""
+        envs = make_batch(self.env_id, n, **env_options)
+        T = envs.episode_steps
+        obs, _ = envs.reset(seed=eval_seed)
+        seen = np.full((n, T + 1, obs.shape[1]), np.nan)
+        u = np.full((n, T, envs.single_action_space.shape[0]), np.nan)
+        reward = np.zeros((n, T))
+        alive, final = np.ones(n, dtype=bool), {}
+        seen[:, 0] = obs
+        for t in range(T):
+            actions = np.asarray(policy(obs, t))
+            u[alive, t] = actions[alive]
+            obs, rewards, terminated, _, info = envs.step(actions)
+            reward[alive, t] = rewards[alive]
+            last = info["final_obs"] if terminated.any() else obs
+            seen[alive, t + 1] = np.where(terminated[:, None], last, obs)[alive]
+            ended = alive & terminated
+            for key, value in info.get("final_info", {}).items():
+                if not key.startswith("_"):
+                    final.setdefault(key, np.zeros_like(value))[ended] = value[ended]
+            alive &= ~terminated
+            if not alive.any():
+                break
+        metrics = {"env_id": self.env_id, "eval_seed": eval_seed, "eval_starts": n}
+        metrics["episodic_return"] = float(reward.sum(axis=1).mean())
+        metrics["episodic_length"] = float(np.isfinite(u[..., 0]).sum(axis=1).mean())
+        for key, value in final.items():
+            if value.ndim == 1 and value.dtype.kind in "fiub" and np.isfinite(value).all():
+                metrics.setdefault(key if key.startswith("episodic_") else f"{key}_mean", float(value.mean()))
+        return metrics, {"t": envs.dt * np.arange(T + 1), "obs": seen, "u": u, "reward": reward}
+
+    def reported_metrics(self, metrics: dict, timed_policy=None, **env_options) -> dict:
+        return {}
+
+    # --- the size of an evaluation, and what a run may not do
+
+    def default_flights(self, is_brief: bool, **env_options) -> int:
+        return 50 if is_brief else 1000
+
+    def interim_flights(self, n: int, **env_options) -> int:
+        return n
+
+    def remark_on_seed(self, eval_seed: int) -> str | None:
+        return f"--eval-seed {eval_seed} is the training's --seed: it may have flown these starts"
+
+    def refusal(self, trains: bool, **env_options) -> tuple[str, str] | None:
+        try:
+            make_batch(self.env_id, 1, **env_options)
+        except BadInput as error:
+            name = next((name for name, value in env_options.items() if not value), "env_id")
+            return (name if name == "env_id" else f"no_{name}"), str(error)
+        return None
+
+    # --- words and pictures
+
+    def table(self, metrics: dict) -> str:
+        lines = [
+            f"{self.env_id}: {metrics['eval_starts']} episodes of eval seed {metrics['eval_seed']}, no optimum known"
+        ]
+        rows = {key: value for key, value in metrics.items() if key.startswith("episodic_") or key.endswith("_mean")}
+        width = max(map(len, rows))
+        return "\n".join([*lines, *(f"  {key:<{width}} {value:>12.4f}" for key, value in rows.items())])
+
+    def seed_rows(self) -> dict[str, tuple[str, str]]:
+        return {"episodic_return": ("episodic return", ".4f"), "episodic_length": ("episodic length", ".1f")}
+
+    def progress_keys(self, **env_options) -> list[str]:
+        return ["episodic_return"]
+
+    def headline(self, metrics: dict) -> str:
+        """A figure's title."""
+        return f"{self.env_id}: mean return {metrics['episodic_return']:.4g} ({metrics['eval_starts']} episodes)"
+
+    def figures(self, arrays: dict, metrics: dict, curves: list[dict]) -> dict:
+        from batched.figures import episodes_figure, training_figure
+
+        figures = {"training.png": training_figure(curves, self.headline(metrics))} if curves else {}
+        figures["episodes.png"] = episodes_figure(arrays, self.headline(metrics), SHOWN_FLIGHTS)
+        return figures
+
+    def animation(self, arrays: dict, metrics: dict):
+        from batched.figures import episodes_animation
+
+        return episodes_animation(arrays, self.headline(metrics), SHOWN_FLIGHTS)
+
+    # --- files
+
+    def required_arrays(self, metrics: dict) -> set[str]:
+        return {"t", "obs", "u", "reward"}
+
+    def kept_arrays(self, arrays: dict) -> dict:
+        """Of the first `KEPT_FLIGHTS`; all arrays but the times are by episode."""
+        return {key: array if key == "t" else array[:KEPT_FLIGHTS] for key, array in arrays.items()}
+
+    # --- commands
+
+    def speed_cases(self) -> list[tuple[str, dict, list | None]]:
+        return [("", {}, None)]
+
+    def add_arguments(self, parser) -> None:
+        """No flags: there is nothing to solve."""
+
+    def baseline_command(self, args) -> tuple[dict, dict]:
+        raise BadInput(
+            f"env_id is {self.env_id!r}, without an optimum; it must be a table (`envs.Problem`) or a rocket"
+        )
+
+    def fly_opponents(self, folder, **options) -> None:
+        raise BadInput(f"the env_id of {folder} is {self.env_id}; it must be a rocket's with cut-off")

@@ -1,0 +1,295 @@
+"""What a table can get wrong: each slip is BadInput, one line that names the field, its value and what is allowed."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Callable
+
+import numpy as np
+
+from common.errors import BadInput, is_finite, refuse_unless
+
+ENV_ID = re.compile(r"[A-Za-z0-9_.-]+-v\d+")
+TRIALS = 8  # points at which the table's functions are tried
+LARGEST_STEP_ERROR = 0.01  # of a Runge-Kutta step, in `x_scale`: beyond it the integrator is far from the dynamics
+
+
+def check_problem(problem):
+    """Refuse a `Problem` that cannot be flown. Sizes and signs first, then its functions are tried."""
+    named = isinstance(problem.env_id, str) and ENV_ID.fullmatch(problem.env_id)
+    refuse_unless(named, "env_id", repr(problem.env_id), "must be letters, digits, _ . - and a version, as 'Mine-v0'")
+    for name in ("f", "parameters", "guess"):
+        function = getattr(problem, name)
+        possible = callable(function) or (name != "f" and function is None)
+        refuse(problem, possible, name, function, "must be a function")
+    check_numbers(problem)
+    phases = problem.phases
+    hint = "must be a tuple of at least one Phase (of one: a comma behind it)"
+    refuse(problem, isinstance(phases, tuple) and len(phases) > 0, "phases", phases, hint)
+    for k, phase in enumerate(phases, start=1):
+        shaped = all(hasattr(phase, name) for name in ("steps", "target", "radius"))
+        refuse(problem, shaped, f"phases[{k - 1}]", phase, "must be a Phase")
+        check_phase(problem, phase, k)
+    try_functions(problem)
+
+
+def refuse(problem, possible, field: str, value, allowed: str):
+    """BadInput that names the table, too."""
+    refuse_unless(possible, f"{field} of {problem.env_id}", one_line(value), allowed)
+
+
+def one_line(value) -> str:
+    """A value as a message shows it."""
+    text = " ".join(repr(value).split())
+    return text if len(text) <= 80 else f"{text[:77]}..."
+
+
+def check_numbers(problem):
+    """The numbers of the table beside its phases."""
+    n_states = "numbers, one for each state"
+    x_max = problem.x_max
+    possible = is_tuple_of(positive, x_max) and len(x_max) > 0
+    refuse(problem, possible, "x_max", x_max, f"must be a tuple of positive {n_states}")
+    n = len(x_max)
+    u_max = problem.u_max
+    one_or_each = "must be one finite number, or a tuple with one for each control"
+    for name in ("u_max", "u_min"):
+        value = getattr(problem, name)
+        possible = is_finite(value) or is_tuple_of(is_finite, value) or (name == "u_min" and value is None)
+        refuse(problem, possible, name, value, one_or_each)
+    if problem.u_min is None:
+        refuse(
+            problem, all(np.atleast_1d(u_max) > 0), "u_max", u_max, "must be positive, without u_min in each control"
+        )
+    else:
+        alike = np.shape(problem.u_min) == np.shape(u_max)
+        refuse(problem, alike, "u_min", problem.u_min, f"must have as many numbers as u_max {u_max}")
+        refuse(problem, all(np.less(*problem.u_box)), "u_min", problem.u_min, f"must be less than u_max {u_max}")
+    check_norm(problem)
+    whole(problem, "substeps", problem.substeps, 1)
+    whole(problem, "scores", problem.scores, 0)
+    refuse(problem, positive(problem.dt), "dt", problem.dt, "must be a positive number of seconds")
+    if problem.u_scale is not None:
+        refuse(problem, positive(problem.u_scale), "u_scale", problem.u_scale, "must be a positive number")
+    check_starts(problem, n)
+    check_rows(problem, n, n_states)
+
+
+def check_norm(problem):
+    """`u_norm`, the least and greatest norm of the control vector."""
+    norm = problem.u_norm
+    if norm is None:
+        return
+    possible = is_tuple_of(is_finite, norm) and len(norm) == 2 and 0 <= norm[0] < norm[1]
+    refuse(problem, possible, "u_norm", norm, "must be a least and a greatest norm, 0 <= least < greatest")
+    refuse(problem, problem.controls > 1, "u_norm", norm, "needs a vector: u_max must be a tuple")
+    holds = problem.u_min is None and all(high == norm[1] for high in problem.u_max)
+    refuse(
+        problem, holds, "u_max", problem.u_max, f"must be the greatest norm {norm[1]} in each control, without u_min"
+    )
+
+
+def check_starts(problem, n: int):
+    """The box or function of the starts."""
+    half, centre = problem.x0_max, problem.x0
+    at_least_0 = lambda value: is_finite(value) and value >= 0  # noqa: E731
+    possible = at_least_0(half) or (is_tuple_of(at_least_0, half) and len(half) == n)
+    refuse(problem, possible, "x0_max", half, f"must be one number of at least 0, or {n}, one for each state")
+    if callable(centre):
+        refuse(
+            problem, problem.scores > 0, "scores", problem.scores, "must be at least 1 where x0 is a function of them"
+        )
+        return
+    possible = centre is None or (is_tuple_of(is_finite, centre) and len(centre) == n)
+    refuse(problem, possible, "x0", centre, f"must be {n} finite numbers, one for each state, or a function of z")
+    edge = np.abs(np.zeros(n) if centre is None else np.array(centre)) + np.array(half)
+    beyond = edge > np.array(problem.x_max)
+    allowed = f"must hold the starts, which go to {edge.tolist()}"
+    refuse(problem, not beyond.any(), "x_max", problem.x_max, allowed)
+
+
+def check_rows(problem, n: int, n_states: str):
+    """What has one entry for each state or control."""
+    scale = problem.x_scale
+    possible = scale is None or (is_tuple_of(positive, scale) and len(scale) == n)
+    refuse(problem, possible, "x_scale", scale, f"must be {n} positive {n_states}")
+    for name, count in (("x_names", n), ("u_names", problem.controls)):
+        names = getattr(problem, name)
+        possible = names is None or (is_tuple_of(lambda word: isinstance(word, str), names) and len(names) == count)
+        refuse(problem, possible, name, names, f"must be {count} words")
+    hidden = problem.velocities
+    possible = hidden is None or is_tuple_of(lambda k: isinstance(k, int) and 0 <= k < n, hidden)
+    refuse(problem, possible, "velocities", hidden, f"must be numbers of states, 0 to {n - 1}")
+    bounds = problem.bounds
+    if bounds is not None:
+        possible = is_tuple_of(is_bound, bounds) and len(bounds) == n
+        refuse(problem, possible, "bounds", bounds, f"must be {n} pairs (least, greatest) or None, one for each state")
+        refuse(
+            problem, positive(problem.bound_price), "bound_price", problem.bound_price, "must be positive with bounds"
+        )
+
+
+def check_phase(problem, phase, k: int):
+    """One phase, the k-th from 1."""
+    n, m = problem.states, problem.controls
+
+    def check(possible, name, allowed):
+        refuse(problem, possible, f"{name} of phase {k}", getattr(phase, name), allowed)
+
+    check(
+        isinstance(phase.steps, int | np.integer) and phase.steps >= 1, "steps", "must be a whole number of at least 1"
+    )
+    number_or_none = lambda value: value is None or is_finite(value)  # noqa: E731
+    target = phase.target
+    possible = target is None or (is_tuple_of(number_or_none, target) and len(target) == n)
+    check(possible, "target", f"must be {n} numbers or None, one for each state (x_max has {n})")
+    aimed = sum(value is not None for value in problem.targets_of(phase))
+    is_radius = lambda value: isinstance(value, int | float) and value > 0  # noqa: E731
+    possible = is_radius(phase.radius) or (is_tuple_of(is_radius, phase.radius) and len(phase.radius) == aimed)
+    check(possible, "radius", f"must be one positive number, or {aimed}, one for each state with a target")
+    check(not phase.has_circle or aimed > 0, "radius", "needs a target")
+    for name, count in (("R", m), ("Q", n)):
+        value = getattr(phase, name)
+        single = name == "R" and is_weight(value)
+        possible = single or (name == "Q" and value is None) or (is_tuple_of(is_weight, value) and len(value) == count)
+        one = "one number of at least 0, or " if name == "R" else ""
+        check(possible, name, f"must be {one}a tuple of {count}, none below 0")
+    for name in ("Qf", "bonus"):
+        check(is_weight(getattr(phase, name)), name, "must be a number of at least 0")
+    check(not phase.bonus or phase.has_circle, "bonus", "needs a radius, within which it is paid")
+    for name in ("running", "terminal", "end", "f"):
+        function = getattr(phase, name)
+        check(function is None or callable(function), name, "must be a function")
+
+
+def try_functions(problem):
+    """Call the table's functions at a few points; their sizes, NaN, and what NumPy arrays or CasADi could not take."""
+    rng = np.random.default_rng(0)
+    draw = problem.draw_scores(rng, TRIALS)
+    p = ()
+    if problem.parameters is not None:
+        refuse(problem, problem.scores > 0, "scores", problem.scores, "must be at least 1 where parameters are drawn")
+        p = attempt(problem, "parameters", problem.parameters, tuple(read_only(draw.T)))
+        refuse(problem, isinstance(p, tuple), "what parameters returns", p, "must be a tuple")
+        p = as_rows(problem, "parameters", p)
+    if callable(problem.x0):
+        x = attempt(problem, "x0", problem.x0, tuple(read_only(draw.T)))
+        check_size(problem, "x0", x, problem.states)
+        x = np.array(as_rows(problem, "x0", x))
+    else:
+        x = problem.starts_in_box(rng, TRIALS).T
+    low, high = problem.u_box
+    u = rng.uniform(low, high, (TRIALS, problem.controls)).T
+    u[:, 0], u[:, 1] = low, high
+    x, u = tuple(read_only(x)), problem.as_control(read_only(u))
+    if problem.guess is not None:
+        controls = attempt(problem, "guess", problem.guess, x)
+        as_rows(problem, "guess", controls if isinstance(problem.u_max, tuple) else (controls,))
+    for k, phase in enumerate(problem.phases, start=1):
+        f = problem.with_parameters(phase.f or problem.f, p)
+        name = "f" if phase.f is None else f"f of phase {k}"
+        derivatives = attempt(problem, name, f, x, u)
+        check_size(problem, name, derivatives, problem.states)
+        as_rows(problem, name, derivatives)
+        for name, arguments in (("running", (x, u)), ("terminal", (x,)), ("end", (x,))):
+            function = getattr(phase, name)
+            if callable(function):
+                field = f"{name} of phase {k}"
+                value = attempt(problem, field, problem.with_parameters(function, p), *arguments)
+                as_rows(problem, field, (value,))
+        check_step(problem, phase, x, u, p)
+
+
+def check_step(problem, phase, x, u, p):
+    """BadInput where a step is too long for its Runge-Kutta formula: two half steps end elsewhere."""
+    with np.errstate(all="ignore"):
+        whole_step, _ = problem.step(phase, x, u, p, problem.dt)
+        half, _ = problem.step(phase, x, u, p, problem.dt / 2)
+        two_halves, _ = problem.step(phase, half, u, p, problem.dt / 2)
+    size = problem.scale[:, None] + np.abs(np.array(two_halves))
+    error = np.max(np.abs(np.array(whole_step) - two_halves) / size)
+    allowed = f"is too long: a step misses by {error:.2g} of its state; it needs a smaller dt, or more substeps"
+    refuse_unless(error <= LARGEST_STEP_ERROR, f"dt of {problem.env_id}", problem.dt, allowed)
+
+
+HINTS = (  # a part of an error's message -> its usual cause
+    ("truth value", "it decides by a value; it may hold no `if`, `min` or `max` of Python, but NumPy's where, minimum"),
+    ("only length-1", "`math`'s functions take one number; it must use NumPy's, as np.sin"),
+    ("only 0-dimensional", "`math`'s functions take one number; it must use NumPy's, as np.sin"),
+    ("only size-1", "`math`'s functions take one number; it must use NumPy's, as np.sin"),
+    ("broadcast", "arrays of different shapes meet; a matrix product must be written out by components"),
+    ("matmul", "arrays of different shapes meet; a matrix product must be written out by components"),
+    ("read-only", "it changes its arguments in place; it must return new values"),
+)
+
+
+def attempt(problem, field: str, function: Callable, *arguments):
+    """What a function of the table returns; BadInput with the usual cause where it fails."""
+    try:
+        with np.errstate(all="ignore"), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return function(*arguments)
+    except Exception as error:  # a user's function can fail in any way
+        hint = next((cause for part, cause in HINTS if part in str(error)), None)
+        why = hint or f"{type(error).__name__}: {error} ({problem.states} states, {problem.controls} controls)"
+        raise BadInput(f"{field} of {problem.env_id} fails: {why}") from error
+
+
+def check_size(problem, field: str, values, count: int):
+    """BadInput unless a function returned a tuple of `count` values."""
+    if not isinstance(values, tuple):
+        allowed = f"must be a tuple of {count}, one for each state (write the components of a matrix product)"
+        refuse(problem, False, f"what {field} returns", f"a {type(values).__name__}", allowed)
+    refuse(problem, len(values) == count, f"the number of what {field} returns", len(values), f"must be {count}")
+
+
+def as_rows(problem, field: str, values) -> tuple:
+    """The values as arrays (TRIALS,), all finite; BadInput names the field."""
+    rows = []
+    for value in values:
+        try:
+            row = np.broadcast_to(np.asarray(value, dtype=np.float64), TRIALS)
+        except (TypeError, ValueError) as error:
+            allowed = "must be one number for each flight"
+            refuse_unless(False, f"what {field} of {problem.env_id} returns", one_line(value), allowed)
+            raise AssertionError from error
+        allowed = f"must be finite at the starts: {one_line(row.tolist())}"
+        refuse_unless(np.isfinite(row).all(), f"a value of {field} of {problem.env_id}", "NaN or infinite", allowed)
+        rows.append(row)
+    return tuple(rows)
+
+
+def read_only(rows: np.ndarray) -> np.ndarray:
+    """A copy that cannot be written to."""
+    rows = rows.copy()
+    rows.setflags(write=False)
+    return rows
+
+
+def whole(problem, name: str, value, least: int):
+    """BadInput unless a whole number of at least `least`."""
+    possible = isinstance(value, int | np.integer) and value >= least
+    refuse(problem, possible, name, value, f"must be a whole number of at least {least}")
+
+
+def positive(value) -> bool:
+    return is_finite(value) and value > 0
+
+
+def is_weight(value) -> bool:
+    return is_finite(value) and value >= 0
+
+
+def is_tuple_of(kind: Callable, value) -> bool:
+    return isinstance(value, tuple) and all(kind(entry) for entry in value)
+
+
+def is_bound(pair) -> bool:
+    """Whether an entry of `bounds` is one."""
+    if pair is None:
+        return True
+    if not (isinstance(pair, tuple) and len(pair) == 2 and all(end is None or is_finite(end) for end in pair)):
+        return False
+    low, high = pair
+    return low is None or high is None or low < high

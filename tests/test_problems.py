@@ -1,0 +1,521 @@
+"""Tables of any number of states and controls: against closed forms, SciPy's integrator and published optima."""
+
+import math
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from scipy.integrate import solve_ivp
+from scipy.special import erf
+from scipy.stats import norm
+
+import baselines
+import envs
+import evaluate
+from common.errors import BadInput, NoOptimum
+from common.integration import falling_root
+from common.tasks import task_of
+from envs import PROBLEMS, Phase, Problem, fly
+from phased.problem import flights_of_seed
+from problems.cart_pole import CART_POLE, cart_pole
+from problems.goddard import GODDARD
+
+ROOT = Path(__file__).parent.parent
+OWN = [env_id for env_id in PROBLEMS if env_id not in {problem.env_id for problem in envs.BUILT_IN}]
+G = 9.80665
+
+
+def free_fall(env_id, **changes):
+    """A stone above the ground: it falls until it touches down. u pushes it up."""
+    table = {
+        "f": lambda x, u: (x[1], u - G),
+        "u_max": 30.0,
+        "phases": (Phase(steps=40, end=lambda x: x[0], running=lambda x, u: 1.0),),
+        "x_max": (1000.0, 200.0),
+        "x0": (10.0, 0.0),
+        "x0_max": (5.0, 0.0),
+    }
+    return Problem(env_id, **{**table, **changes})
+
+
+def hold(*u):
+    """A policy that holds a control."""
+    return lambda obs, t: np.tile(np.array(u, dtype=float), (len(obs), 1))
+
+
+# --- the environment --------------------------------------------------------------------------------------------------
+
+
+def test_a_fall_ends_at_the_ground(new_problem):
+    """At sqrt(2 h / g), between two steps; the running cost is that time, and what lies behind the end is NaN."""
+    env_id = new_problem(free_fall("Stone-v0"))
+    heights = np.array([5.0, 10.0, 12.345])
+    flight = fly(env_id, hold(0.0), np.column_stack([heights, np.zeros(3)]))
+    seconds = np.sqrt(2 * heights / G)
+    np.testing.assert_allclose(flight["final_time"], seconds, rtol=1e-12)
+    np.testing.assert_allclose(flight["cost"], seconds, rtol=1e-12)
+    assert flight["cost_running"] == pytest.approx(seconds)
+    for x, u, time in zip(flight["x"], flight["u"], seconds):
+        steps = math.ceil(time / 0.1)
+        assert np.isfinite(x[: steps + 1]).all() and np.isnan(x[steps + 1 :]).all()
+        assert np.isfinite(u[:steps]).all() and np.isnan(u[steps:]).all()
+        assert x[steps] == pytest.approx([0.0, -G * time], abs=1e-11) and x[steps, 0] <= 0
+
+
+@pytest.mark.parametrize("speed, touches", [(-1.0, True), (-0.9, False)])
+def test_a_soft_touchdown_between_steps_is_seen(new_problem, speed, touches):
+    """Braked by 10 m/s^2 from 0.045 m: at 1 m/s it would come to rest at 0.05 m, and after 0.1 s lift off again."""
+    env_id = new_problem(
+        free_fall(f"Soft{touches}-v0", x0_max=0.0, dt=0.5, phases=(Phase(steps=1, end=lambda x: x[0]),))
+    )
+    flight = fly(env_id, hold(G + 10.0), np.array([[0.045, speed]]))
+    time = 0.1 - math.sqrt(0.01 - 0.009) if touches else 0.5
+    assert flight["final_time"][0] == pytest.approx(time, rel=1e-10)
+
+
+def test_a_flight_does_not_depend_on_its_neighbours(new_problem):
+    """Also where they end in other steps, and are reset in between."""
+    env_id = new_problem(free_fall("Neighbour-v0"))
+    x0 = np.column_stack([np.linspace(5, 15, 9), np.zeros(9)])
+    together = fly(env_id, hold(3.0), x0)
+    for n in range(9):
+        alone = fly(env_id, hold(3.0), x0[n : n + 1])
+        for key, value in alone.items():
+            np.testing.assert_array_equal(value[0], together[key][n])
+    batch = gym.make_vec(env_id, num_envs=9)
+    batch.reset(seed=0, options={"x0": x0})
+    ended = []
+    for _ in range(30):
+        _, _, terminated, _, info = batch.step(np.full((9, 1), 3.0))
+        for n in np.flatnonzero(terminated):
+            ended.append(n)
+            if ended.count(n) == 1:
+                assert info["final_info"]["final_time"][n] == together["final_time"][n]
+    assert set(ended) == set(range(9))
+
+
+def test_phases_begin_where_the_event_was(new_problem):
+    """Fall to 5 m, then drift at constant speed for two steps: each phase with dynamics of its own."""
+    phases = (
+        Phase(steps=40, end=lambda x: x[0] - 5.0),
+        Phase(steps=2, f=lambda x, u: (x[1], 0.0 * u), target=(5.0, None), radius=100.0, terminal=lambda x: x[0]),
+    )
+    env_id = new_problem(free_fall("Drift-v0", phases=phases, x0_max=0.0))
+    flight = fly(env_id, hold(0.0), np.array([[10.0, 0.0]]))
+    falls = math.sqrt(2 * 5 / G)
+    assert flight["final_time"][0] == pytest.approx(falls + 0.2, rel=1e-12)
+    assert flight["cost_terminal"][0] == pytest.approx(5 - G * falls * 0.2, rel=1e-9)
+    batch = gym.make_vec(env_id, num_envs=1)
+    obs, _ = batch.reset(seed=0)
+    seen = [obs[0]]
+    for _ in range(math.ceil(falls / 0.1)):
+        seen.append(batch.step(np.zeros((1, 1)))[0][0])
+    assert [row[-1] for row in seen] == [0.0] * (len(seen) - 1) + [1.0]  # phi
+    assert seen[-1][-2] == pytest.approx(falls / 4.2)  # tau: the time over the longest
+
+
+def test_weights_count_in_proportion_to_a_step_that_is_cut(new_problem):
+    phase = Phase(steps=40, end=lambda x: x[0], target=(0.0, 0.0), Q=(1.0, 0.0), R=2.0)
+    env_id = new_problem(free_fall("Share-v0", phases=(phase,), x0_max=0.0))
+    flight = fly(env_id, hold(1.0), np.array([[0.3, 0.0]]))
+    time = math.sqrt(2 * 0.3 / (G - 1))
+    shares = np.array([1.0, 1.0, time / 0.1 - 2])
+    heights = 0.3 - (G - 1) / 2 * np.array([0.0, 0.1, 0.2]) ** 2
+    assert flight["cost_state"][0] == pytest.approx((shares * heights**2).sum(), rel=1e-10)
+    assert flight["cost_control"][0] == pytest.approx(2 * shares.sum(), rel=1e-10)
+
+
+def test_running_cost_is_an_integral(new_problem):
+    """Of u^2 + x over a constant push: exact, since x is a polynomial."""
+    phase = Phase(steps=10, running=lambda x, u: u**2 + x[0])
+    problem = Problem("Integral-v0", lambda x, u: (x[1], u), 5.0, (phase,), (100.0, 100.0), x0_max=0.0)
+    flight = fly(new_problem(problem), hold(3.0), np.zeros((1, 2)))
+    assert flight["cost"][0] == pytest.approx(9 + 3 / 6, rel=1e-13)  # 3 t^2 / 2 from 0 to 1
+
+
+def test_bounds_have_a_price(new_problem):
+    """A second at one scale beyond costs `bound_price`: held at 3 where 1 is allowed and the scale 0.5."""
+    phase = Phase(steps=4, terminal=lambda x: 0.0 * x[0])
+    table = {"bounds": ((None, 1.0), (-2.0, None)), "bound_price": 7.0, "x_scale": (0.5, 1.0)}
+    problem = Problem(
+        "Price-v0", lambda x, u: (0.0 * x[0], u), 5.0, (phase,), (9.0, 9.0), x0=(3.0, 0.0), x0_max=0.0, **table
+    )
+    flight = fly(new_problem(problem), hold(0.0), np.array([[3.0, 0.0]]))
+    assert flight["cost_bounds"][0] == pytest.approx(7 * 0.4 * 2 / 0.5)
+    assert flight["reward"].sum() == pytest.approx(-flight["cost"][0])
+
+
+def test_the_set_of_controls(new_problem):
+    """A box that is not about 0; a vector between two norms keeps its direction, and 0 points along the last axis."""
+    phase = Phase(steps=1)
+    box = Problem("Box-v0", lambda x, u: (u[0], u[1]), (3.0, 1.0), (phase,), (9.0, 9.0), u_min=(1.0, -1.0))
+    flight = fly(new_problem(box), hold(0.0, 5.0), np.zeros((1, 2)))
+    assert flight["u"].tolist() == [[[1.0, 1.0]]]
+    batch = gym.make_vec("Box-v0", num_envs=1, scaled_action=True)
+    assert batch.single_action_space.low.tolist() == [-1, -1] and batch.single_action_space.high.tolist() == [1, 1]
+    batch.reset(seed=0)
+    batch.step(np.array([[0.5, -0.25]]))
+    assert batch.u.tolist() == [[2.5, -0.25]]
+
+    ring = Problem("Ring-v0", lambda x, u: (u[0], u[1]), (2.0, 2.0), (phase,), (9.0, 9.0), u_norm=(1.0, 2.0))
+    new_problem(ring)
+    for action, applied in (
+        ((0.3, 0.4), (0.6, 0.8)),
+        ((3.0, 4.0), (1.2, 1.6)),
+        ((0.0, -1.5), (0.0, -1.5)),
+        ((0, 0), (0, 1)),
+    ):
+        flight = fly("Ring-v0", hold(*action), np.zeros((1, 2)))
+        assert flight["u"][0, 0] == pytest.approx(applied)
+
+
+def drawn(env_id):
+    """A wind that is drawn and hidden, and a start that depends on the same scores."""
+    return Problem(
+        env_id,
+        f=lambda x, u, p: (x[1], u + p[0]),
+        u_max=2.0,
+        phases=(Phase(steps=5, running=lambda x, u, p: p[0] ** 2, terminal=lambda x, p: x[0] ** 2),),
+        x_max=(50.0, 50.0),
+        scores=2,
+        x0=lambda z: (1.0 + 0.1 * z[1], 0.0 * z[1]),
+        parameters=lambda z: (0.5 * z[0],),
+    )
+
+
+def test_hidden_parameters_are_drawn(new_problem):
+    env_id = new_problem(drawn("Wind-v0"))
+    z = np.array([[1.0, 0.0], [-2.0, 1.0]])
+    x0 = np.column_stack([1.0 + 0.1 * z[:, 1], np.zeros(2)])
+    flight = fly(env_id, hold(0.0), x0, z)
+    wind = 0.5 * z[:, 0]
+    np.testing.assert_allclose(flight["x"][:, -1, 0], x0[:, 0] + wind * 0.5**2 / 2, rtol=1e-12)
+    np.testing.assert_allclose(flight["cost_running"], 0.5 * wind**2, rtol=1e-12)
+    np.testing.assert_array_equal(flight["draw"], z)
+    hidden, shown = (gym.make_vec(env_id, num_envs=2, observe_draw=show) for show in (False, True))
+    obs, _ = hidden.reset(seed=3)
+    seen, _ = shown.reset(seed=3)
+    assert obs.shape == (2, 3) and seen.shape == (2, 5)
+    np.testing.assert_array_equal(seen[:, 3:], shown.draw)
+    np.testing.assert_allclose(seen[:, 0], 1.0 + 0.1 * seen[:, 4], rtol=1e-15)
+    shown.flights_per_start = 2
+    shown.reset(seed=4)
+    assert (shown.draw[0] == shown.draw[1]).all()
+    one = gym.make(env_id)
+    assert one.reset(options={"draw": [0.0, 2.0]})[0][0] == pytest.approx(1.2)
+    with pytest.raises(BadInput, match=r"options\['draw'\] must be finite, of shape \(2, 2\)"):
+        shown.reset(options={"draw": [[1.0, math.nan], [0.0, 0.0]]})
+
+
+def test_scores_of_a_seed_are_standard_and_clipped():
+    _, z = flights_of_seed(drawn("Scores-v0"), 0, 4000)
+    assert np.abs(z).max() == 3.0 and abs(z.mean()) < 0.03 and z.std() == pytest.approx(0.998, abs=0.01)
+    np.testing.assert_allclose(envs.uniform(z[:, 0], -2, 5), -2 + 7 * norm.cdf(z[:, 0]))
+
+
+def test_the_command_of_the_step_before_is_shown(new_problem):
+    env_id = new_problem(free_fall("Command-v0"))
+    batch = gym.make_vec(env_id, num_envs=1, observe_command=True)
+    assert batch.reset(seed=0)[0][0, -1] == 0
+    assert batch.step(np.array([[99.0]]))[0][0, -1] == 30.0  # as it was applied
+
+
+def test_velocities_can_be_hidden():
+    obs = gym.make("CartPoleSwingUp-v0", observe_velocity=False).reset(options={"x0": [1.0, 2.0, 3.0, 4.0]})[0]
+    assert obs.tolist() == [1.0, 2.0, 0.0, 0.0, 0.0]
+    with pytest.raises(BadInput, match="observe_velocity is False; it needs `velocities` in the table"):
+        gym.make("Goddard-v0", observe_velocity=False)
+
+
+def test_the_cart_pole_flies_as_by_scipy():
+    """And without force and gravity's work its energy is kept: the equations are those of a cart with a pole."""
+    rng = np.random.default_rng(0)
+    forces = rng.uniform(-20, 20, (CART_POLE.steps, 1))
+    flight = fly("CartPoleSwingUp-v0", lambda obs, t: forces[t : t + 1], np.zeros((1, 4)))
+    x = np.zeros(4)
+    for force in forces[:, 0]:
+        held = lambda t, x, u=force: np.array(cart_pole(tuple(x), u))  # noqa: E731
+        x = solve_ivp(held, (0, CART_POLE.dt), x, "DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
+    np.testing.assert_allclose(flight["x"][0, -1], x, rtol=1e-3, atol=1e-3)
+    free = solve_ivp(lambda t, x: cart_pole(tuple(x), 0.0), (0, 3), [0, 2.0, 0.3, 1.0], rtol=1e-11, atol=1e-11).y
+    q, angle, speed, rate = free
+    pole_x, pole_y = speed + 0.5 * rate * np.cos(angle), 0.5 * rate * np.sin(angle)
+    energy = 0.5 * speed**2 + 0.5 * 0.3 * (pole_x**2 + pole_y**2) - 0.3 * 9.81 * 0.5 * np.cos(angle)
+    np.testing.assert_allclose(energy, energy[0], rtol=1e-8)
+
+
+@pytest.mark.parametrize("env_id", OWN)
+def test_every_table_of_ours_is_an_environment(env_id):
+    problem = PROBLEMS[env_id]
+    check_env(gym.make(env_id).unwrapped, skip_render_check=True)
+    (low, high), space = problem.u_box, gym.make(env_id).observation_space
+    x0, draw = flights_of_seed(problem, 0, 6)
+    noise = np.random.default_rng(0).uniform(low, high, (problem.steps, 6, problem.controls))
+    for policy in (hold(*high), hold(*low), lambda obs, t: noise[t]):
+        flight = fly(env_id, policy, x0, draw)
+        seen = flight["x"][np.isfinite(flight["x"]).all(axis=2)]
+        assert (np.abs(seen) <= problem.x_max).all(), "x_max bounds every reachable state"
+        bonus = (flight["hit"] * [phase.bonus for phase in problem.phases]).sum(axis=1)
+        np.testing.assert_allclose(flight["episodic_return"], bonus - flight["cost"], rtol=1e-12)
+        np.testing.assert_allclose(flight["reward"].sum(axis=1), flight["episodic_return"], rtol=1e-9, atol=1e-9)
+        parts = sum(flight[f"cost_{part}"] for part in problem.parts)
+        np.testing.assert_allclose(parts, flight["cost"], rtol=1e-12)
+    assert space.contains(gym.make(env_id).reset(seed=0)[0])
+
+
+@pytest.mark.parametrize("env_id", OWN)
+def test_every_table_of_ours_is_measured_and_drawn(env_id, tmp_path):
+    problem = PROBLEMS[env_id]
+    n = 10 if problem.has_one_flight else 3
+    metrics, arrays = evaluate.evaluate(env_id, hold(*problem.u_centre), 0, n)
+    assert all(np.isfinite(value) for value in metrics.values() if isinstance(value, float))
+    assert task_of(env_id).required_arrays(metrics) <= arrays.keys()
+    table = task_of(env_id).table(metrics)
+    assert table.startswith(env_id) and "nan" not in table
+    for path in evaluate.draw_figures(tmp_path, arrays, metrics, []):
+        assert path.stat().st_size > 5000
+    animation = task_of(env_id).animation(arrays, metrics)
+    assert animation.frame(5).shape == (450, 800, 3)
+    env = gym.make(env_id, render_mode="rgb_array")
+    env.reset(seed=0)
+    env.step(env.action_space.sample())
+    assert env.render().shape == (450, 800, 3)
+
+
+def test_a_root_is_found_to_rounding():
+    """Of functions that are not straight: at 0 or just below."""
+    roots = np.array([0.013, 0.4, 0.999])
+    value = lambda h: (roots - h) * (1 + 3 * h + 5 * h**2)  # noqa: E731
+    found = falling_root(value, value(np.zeros(3)), value(np.ones(3)), np.ones(3))
+    np.testing.assert_allclose(found, roots, rtol=0, atol=1e-12)
+    assert (value(found) <= 0).all()
+
+
+# --- the optimum ------------------------------------------------------------------------------------------------------
+
+
+def optimum(problem, new_problem):
+    env_id = new_problem(problem)
+    x0, draw = flights_of_seed(problem, 0, 1)
+    flight = baselines.reference(env_id, x0, draw=draw)
+    return flight, baselines.compare_finer(env_id, x0, flight, draw)
+
+
+def bryson_denham(steps):
+    phase = Phase(steps, (0.0, -1.0), 1e-5, bonus=20.0, running=lambda x, u: 0.5 * u**2)
+    table = {"x0": (0.0, 1.0), "bounds": ((None, 1 / 9), None), "bound_price": 1000.0}
+    return Problem(f"Bryson{steps}-v0", lambda x, u: (x[1], u), 10.0, (phase,), (7.0, 12.0), 1 / steps, 0.0, **table)
+
+
+def test_bryson_denham(new_problem):
+    """Bryson and Ho, Applied Optimal Control, section 3.11: J = 4 / (9 l) = 4 at l = 1/9."""
+    flight, finer = optimum(bryson_denham(50), new_problem)
+    assert flight["cost"][0] == pytest.approx(4.0034, abs=3e-4)
+    assert finer["finer_cost_mean"] == pytest.approx(4.0, abs=3e-4)
+    assert finer["finer_collocation_cost_mean"] == pytest.approx(finer["finer_cost_mean"], abs=1e-6)
+    assert flight["x"][0, :, 0].max() <= 1 / 9 + 1e-9 and flight["cost_bounds"][0] < 1e-6
+
+
+def test_minimum_time(new_problem):
+    """Of the double integrator from (1, 0) to rest at 0 with |u| <= 1: 2 s, one switch half-way."""
+    phase = Phase(40, (None, 0.0), 1e-3, bonus=10.0, running=lambda x, u: 1.0, end=lambda x: x[0])
+    problem = Problem("Soonest-v0", lambda x, u: (x[1], u), 1.0, (phase,), (20.0, 5.0), 0.1, 0.0, x0=(1.0, 0.0))
+    flight, finer = optimum(problem, new_problem)
+    assert flight["final_time"][0] == pytest.approx(2.0 - 1e-3, abs=3e-4)  # a miss of 0.001 m/s saves 0.001 s
+    assert finer["finer_cost_mean"] == pytest.approx(2.0 - 1e-3, abs=3e-4)
+    assert flight["u"][0, :9].max() < -0.999 and flight["u"][0, 11:19].min() > 0.999
+
+
+@pytest.mark.slow
+def test_brachistochrone(new_problem):
+    """From (0, 10) to (10, 5) without friction: 1.8016 s. The control is the angle from straight down."""
+    phase = Phase(200, (None, 5.0, None), 1e-5, bonus=10.0, running=lambda x, u: 1.0, end=lambda x: 10 - x[0])
+    fall = lambda x, u: (x[2] * np.sin(u), -x[2] * np.cos(u), G * np.cos(u))  # noqa: E731
+    table = {"x0": (0.0, 10.0, 0.0), "guess": lambda x: 0.9}
+    problem = Problem("Brachistochrone-v0", fall, np.pi, (phase,), (50.0, 50.0, 50.0), 0.02, 0.0, **table)
+    flight, finer = optimum(problem, new_problem)
+    assert flight["final_time"][0] == pytest.approx(1.8016, abs=1e-4)
+    assert finer["finer_collocation_cost_mean"] == pytest.approx(1.8016, abs=5e-5)
+
+
+@pytest.mark.slow
+def test_goddard():
+    """The greatest height of the classic constants is 1.01283 (COPS, problem "rocket"; Bryson 1999)."""
+    x0, draw = flights_of_seed(GODDARD, 0, 1)
+    flight = baselines.reference(GODDARD.env_id, x0, draw=draw)
+    finer = baselines.compare_finer(GODDARD.env_id, x0, flight, draw)
+    assert 1 + -flight["cost"][0] / 100 == pytest.approx(1.01283, abs=1e-5)
+    assert 1 + -finer["finer_cost_mean"] / 100 == pytest.approx(1.01283, abs=1e-5)
+    assert flight["x"][0, :, 2][np.isfinite(flight["x"][0, :, 2])].min() >= 0.6 - 1e-9
+
+
+def test_cart_pole_by_two_transcriptions(new_problem):
+    """Kelly's swing-up ends at a point. From a straight line we find his 58.8; another swing costs 57.95."""
+    phase = replace(CART_POLE.phases[0], steps=50, radius=1e-4, Qf=0.0, bonus=100.0)
+    kelly = replace(CART_POLE, env_id="Kelly-v0", phases=(phase,), dt=0.04, substeps=2)
+    flight, finer = optimum(kelly, new_problem)
+    assert finer["finer_cost_mean"] == pytest.approx(57.95, abs=0.02)
+    assert finer["finer_collocation_cost_mean"] == pytest.approx(finer["finer_cost_mean"], abs=1e-3)
+    one = replace(kelly, env_id="KellyLine-v0")
+    new_problem(one)
+    x0, draw = flights_of_seed(one, 0, 1)
+    job = baselines.Job(one.env_id, baselines.shooting, True, 0, x0[0], draw[0])
+    line = list(baselines.guesses(one, x0[0], draw[0]))[1]
+    coarse = baselines.solve_on(one, baselines.Mesh.of(one), job, line)
+    sketches = baselines.sketches_of(one, coarse.mesh, x0[0], coarse.unknowns)
+    fine = baselines.solve_on(one, coarse.mesh.refined(4), job, sketches)
+    assert fine.succeeded and fine.cost == pytest.approx(58.82, abs=0.03)
+
+
+def test_the_optimum_knows_the_hidden_parameters(new_problem):
+    """Linear dynamics with a drawn wind, cost u^2 and a free end but x(T) = 0: u = -(x0 + ...) by minimum norm."""
+    phase = Phase(10, (0.0, None), 1e-6, bonus=100.0, running=lambda x, u, p: u**2)
+    table = {"scores": 1, "parameters": lambda z: (z[0],), "x0_max": 0.5}
+    problem = Problem("Windy-v0", lambda x, u, p: (x[1], u + p[0]), 20.0, (phase,), (99.0, 99.0), **table)
+    env_id = new_problem(problem)
+    x0, z = flights_of_seed(problem, 0, 3)
+    flight = baselines.reference(env_id, x0, draw=z)
+    weights = 0.1 * (1 - 0.05 - 0.1 * np.arange(10))  # what a unit of each held control adds to x(1)
+    miss = x0[:, 0] + x0[:, 1] + z[:, 0] / 2
+    np.testing.assert_allclose(flight["u"], -np.outer(miss, weights) / (weights**2).sum(), atol=1e-5)
+
+
+def test_an_end_out_of_reach_is_one_line(new_problem):
+    phase = Phase(5, (100.0, None), 0.1, bonus=1.0, running=lambda x, u: u**2)
+    env_id = new_problem(Problem("Far-v0", lambda x, u: (x[1], u), 1.0, (phase,), (200.0, 9.0)))
+    with pytest.raises(NoOptimum, match=r"^start 0, x0 = .* of Far-v0 has no flight within its circles, bounds"):
+        baselines.reference(env_id, np.zeros((1, 2)))
+
+
+def test_a_function_that_casadi_cannot_take_is_one_line(new_problem):
+    table = lambda x, u: (x[1], u - erf(x[0]))  # noqa: E731
+    phase = Phase(5, (0.0, 0.0), 0.1, R=0.1, Qf=20.0, bonus=1.0)
+    env_id = new_problem(Problem("Erf-v0", table, 1.0, (phase,), (20.0, 20.0)))
+    with pytest.raises(NoOptimum, match="^the functions of Erf-v0 fail on CasADi's symbols"):
+        baselines.reference(env_id, np.zeros((1, 2)))
+
+
+def test_equal_starts_are_solved_once(new_problem, monkeypatch):
+    env_id, solved = new_problem(bryson_denham(20)), []
+    solve = baselines.best_solution
+    monkeypatch.setattr(baselines, "best_solution", lambda job: solved.append(job.index) or solve(job))
+    flight = baselines.reference(env_id, np.tile([0.0, 1.0], (50, 1)))
+    assert solved == [0] and len(flight["cost"]) == 50 and np.ptp(flight["cost"]) == 0
+
+
+# --- slips ------------------------------------------------------------------------------------------------------------
+
+PHASE = Phase(steps=20, target=(0.0, 0.0), radius=0.05, R=0.1, Qf=20.0, bonus=20.0)
+
+
+def spring(x, u):
+    x1, x2 = x
+    return x2, -x1 + u
+
+
+def in_place(x, u):
+    a, b = x
+    b += 0.1 * u
+    return b, -a + u
+
+
+def phase(**changes):
+    return {"phases": (replace(PHASE, **changes),)}
+
+
+SLIPS = {
+    "four states": ({"f": lambda x, u: (x[2], x[3], u, u), "x_max": (10.0,) * 4}, "target of phase 1"),
+    "one derivative": ({"f": lambda x, u: (x[1],)}, "the number of what f returns"),
+    "no tuple": ({"f": lambda x, u: x[1]}, "what f returns"),
+    "matrix": ({"f": lambda x, u: np.array([[0, 1], [-1, 0]]) @ np.array(x) + np.array([0, 1]) * u}, "f of .*matrix"),
+    "math.sin": ({"f": lambda x, u: (x[1], -math.sin(x[0]) + u)}, "f of .* NumPy's, as np.sin"),
+    "max": ({"f": lambda x, u: (x[1], max(u, -x[0]))}, "f of .* decides by a value"),
+    "in place": ({"f": in_place}, "f of .* changes its arguments in place"),
+    "raises": ({"f": lambda x, u: (x[1], u + undefined)}, "f of .* NameError"),  # noqa: F821
+    "NaN": ({"f": lambda x, u: (x[1], u + np.sqrt(x[0] - 2))}, "a value of f .* NaN"),
+    "no function": ({"f": 3.0}, "f of Mine-v0 is 3.0"),
+    "no comma": ({"phases": PHASE}, "phases of Mine-v0 .* comma"),
+    "no phases": ({"phases": ()}, "phases of Mine-v0"),
+    "steps 0": (phase(steps=0), "steps of phase 1"),
+    "steps 2.5": (phase(steps=2.5), "steps of phase 1"),
+    "R negative": (phase(R=-0.1), "R of phase 1"),
+    "R of two": (phase(R=(0.1, 0.1)), "R of phase 1"),
+    "Qf negative": (phase(Qf=-20.0), "Qf of phase 1"),
+    "radius 0": (phase(radius=0.0), "radius of phase 1"),
+    "radius negative": (phase(radius=-0.05), "radius of phase 1"),
+    "radii of three": (phase(radius=(0.1, 0.1, 0.1)), "radius of phase 1"),
+    "target of three": (phase(target=(0.0, 0.0, 0.0)), "target of phase 1"),
+    "target a number": (phase(target=1.0), "target of phase 1"),
+    "target NaN": (phase(target=(math.nan, 0.0)), "target of phase 1"),
+    "radius without target": (phase(target=None), "radius of phase 1"),
+    "bonus without radius": (phase(radius=math.inf), "bonus of phase 1"),
+    "Q a number": (phase(Q=1.0), "Q of phase 1"),
+    "end no function": (phase(end=1.0), "end of phase 1"),
+    "running of two": (phase(running=lambda x: 1.0), "running of phase 1"),
+    "terminal NaN": (phase(terminal=lambda x: np.nan * x[0]), "a value of terminal of phase 1"),
+    "u_max 0": ({"u_max": 0.0}, "u_max"),
+    "u_max negative": ({"u_max": -1.0}, "u_max"),
+    "u_max a pair": ({"u_max": (-1.0, 1.0)}, "u_max"),
+    "u_min above": ({"u_min": 2.0}, "u_min"),
+    "u_norm of one control": ({"u_norm": (0.5, 1.0)}, "u_norm"),
+    "u_norm reversed": ({"u_max": (1.0, 1.0), "u_norm": (1.0, 0.5)}, "u_norm"),
+    "x_max too small": ({"x_max": (0.1, 0.1)}, "x_max"),
+    "x_max of one": ({"x_max": (20.0,)}, "x_max has 1"),
+    "x_max a number": ({"x_max": 20.0}, "x_max"),
+    "dt 0": ({"dt": 0.0}, "dt"),
+    "dt negative": ({"dt": -0.1}, "dt"),
+    "dt too long": ({"dt": 5.0}, "dt of Mine-v0 is 5.0; it is too long"),
+    "x0_max negative": ({"x0_max": -1.0}, "x0_max"),
+    "x0 of three": ({"x0": (0.0, 0.0, 0.0)}, "x0"),
+    "x0 without scores": ({"x0": lambda z: (z[0], z[0])}, "scores"),
+    "parameters without scores": ({"parameters": lambda z: (1.0,)}, "scores"),
+    "bounds of one": ({"bounds": ((0.0, 1.0),)}, "bounds"),
+    "bounds reversed": ({"bounds": ((1.0, 0.0), None)}, "bounds"),
+    "bounds without a price": ({"bounds": ((0.0, 1.0), None)}, "bound_price"),
+    "x_scale 0": ({"x_scale": (0.0, 1.0)}, "x_scale"),
+    "names of one": ({"x_names": ("angle",)}, "x_names"),
+    "velocities beyond": ({"velocities": (2,)}, "velocities"),
+    "substeps 0": ({"substeps": 0}, "substeps"),
+    "no version": ({"env_id": "Mine"}, "env_id"),
+    "a space": ({"env_id": "My problem-v0"}, "env_id"),
+}
+
+
+@pytest.mark.parametrize("slip", SLIPS)
+def test_a_slip_in_a_table_is_one_line_that_names_the_field(slip):
+    changes, message = SLIPS[slip]
+    table = {"env_id": "Mine-v0", "f": spring, "u_max": 1.0, "x_max": (20.0, 20.0), "x0_max": 1.5, "phases": (PHASE,)}
+    Problem(**table)
+    with pytest.raises(BadInput, match=message) as refused:
+        Problem(**{**table, **changes})
+    assert "\n" not in str(refused.value)
+
+
+def test_an_id_that_is_taken_is_refused():
+    mine = Problem("VanDerPol-v0", spring, 1.0, (PHASE,), (20.0, 20.0))
+    for put in (envs.register_problem, lambda table: PROBLEMS.__setitem__(table.env_id, table)):
+        with pytest.raises(BadInput, match="^env_id is 'VanDerPol-v0'; it is taken already"):
+            put(mine)
+    assert PROBLEMS["VanDerPol-v0"] is envs.VAN_DER_POL
+    with pytest.raises(BadInput, match="^the id is 'Other-v0'; it must be the table's, VanDerPol-v0"):
+        PROBLEMS["Other-v0"] = mine
+
+
+def test_a_file_that_fails_is_left_out_with_one_line(tmp_path):
+    """The others are there: the command of another id still works."""
+    for part in ("batched", "common", "drawing", "phased", "rocket", "vehicles", "problems"):
+        (tmp_path / part).symlink_to(ROOT / part)
+    (tmp_path / "problems").unlink()
+    (tmp_path / "problems").mkdir()
+    (tmp_path / "problems" / "mine.py").write_text("import envs\nenvs.Problem('Mine', None, 1.0, (), (1.0,))\n")
+    (tmp_path / "envs.py").write_text((ROOT / "envs.py").read_text())
+    command = [sys.executable, "-c", "import envs; print(*envs.own_ids())"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0 and done.stdout.strip() == ""
+    assert re.fullmatch(r"problems/mine.py is left out: env_id is 'Mine'; .*\n", done.stderr)
