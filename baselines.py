@@ -156,7 +156,7 @@ def box_qp(problem: Problem, x0):
     states = (weight[:, :, None] * Gamma).reshape(-1, T)
     offsets = (weight * (Phi @ np.asarray(x0, dtype=float)[:, None, :, None])[..., 0]).reshape(len(x0), -1)
     system = np.vstack([states, np.sqrt(phase.R) * np.eye(T)])
-    bounds = (-problem.u_max, problem.u_max)
+    bounds = tuple(problem.u_box[:, 0])
     return np.array(
         [lsq_linear(system, np.append(-b, np.zeros(T)), bounds, method="bvls", tol=1e-15).x for b in offsets]
     )
@@ -228,7 +228,8 @@ def program(problem: Problem, mesh: Mesh, defect: Callable, in_circles: bool):
     ca.GlobalOptions.setNumpyMode(1)  # np.sin of a symbol is a symbol, without the warning that it was not always so
     n, m, T = problem.states, problem.controls, sum(mesh.counts)
     hidden = len(problem.hidden(np.zeros((1, problem.scores))))
-    x0, p, u, x = (ca.SX.sym(*size) for size in (("x0", n), ("p", hidden), ("u", m, T), ("x", n, T)))
+    x0, p = ca.SX.sym("x0", n), ca.SX.sym("p", hidden)
+    u, x = ca.SX.sym("u", m, T), ca.SX.sym("x", n, T)
     h = ca.SX.sym("h", sum(phase.end is not None for phase in problem.phases))
     parameters, lengths = tuple(ca.vertsplit(p)), iter(ca.vertsplit(h))
     state, t, cost, defects, circles, events, norms = tuple(ca.vertsplit(x0)), 0, 0, [], [], [], []
@@ -369,7 +370,7 @@ def guess_policies(problem: Problem) -> list[Callable]:
     """
     low, high = problem.u_box
     if problem.guess is not None:
-        return [law_of(problem)]
+        return [law_of(problem, problem.guess)]
     if not problem.weighted or problem.has_events:
         constants = [problem.u_centre, high, low]
         if problem.u_norm is not None:
@@ -386,11 +387,11 @@ def guess_policies(problem: Problem) -> list[Callable]:
     return [near, pump]
 
 
-def law_of(problem: Problem) -> Callable:
-    """The table's `guess` as a policy for `envs.fly`."""
+def law_of(problem: Problem, law: Callable) -> Callable:
+    """A feedback law u = law(x) of the table as a policy for `envs.fly`."""
 
     def policy(obs, t):
-        controls = problem.guess(tuple(obs[:, : problem.states].T))
+        controls = law(tuple(obs[:, : problem.states].T))
         rows = controls if isinstance(problem.u_max, tuple) else (controls,)
         return np.column_stack([np.broadcast_to(row, len(obs)) for row in rows])
 
@@ -716,7 +717,8 @@ def waypoint_reference(env_id: str, x0, processes: int | None = None, draw=None)
     price = np.full(free["hit"].shape, np.nan)
     with_circle = [k for k, phase in enumerate(PROBLEMS[env_id].phases) if phase.has_circle]
     radius = np.array([np.max(PROBLEMS[env_id].phases[k].radius) for k in with_circle])  # of an ellipse its long axis
-    price[np.ix_(feasible, with_circle)] = (multipliers * 2 / radius)[feasible]  # on the edge d(|dx|^2 / r^2)/dr = -2/r
+    # on the edge d(|dx|^2 / r^2) / dr = -2 / r
+    price[:, with_circle] = np.where(feasible[:, None], multipliers * 2 / radius, np.nan)
     compared = {"cost_free": free["cost"], "terminal_error_free": free["terminal_error"], "circle_price": price}
     return {**best, "constrained": constrained, "infeasible": ~feasible, **compared}
 
@@ -898,7 +900,7 @@ def main() -> None:
     limit["seconds"] = args.solve_seconds
     try:
         save(args, *args.solve(args))
-    except (ImportError, OSError, RuntimeError) as error:
+    except (BadInput, ImportError, OSError, RuntimeError) as error:
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:
         sys.exit(130)

@@ -28,7 +28,7 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 import runs
 from common.tasks import ForEachId
 from cuda_graphs import speed_up
-from envs import own_ids
+from envs import PROBLEMS, own_ids
 from runs import Schedule, all_reduce_sum
 
 
@@ -135,11 +135,26 @@ RECIPES = {
         "log_radius": "0:1.8 0.35:0 0.35:-0.1",
     },
 }
+OWN = {  # a problem of your own: flights are compared from the first update on, which makes its units indifferent
+    **OURS,
+    "gae_lambda": 1.0,
+    "update_epochs": 4,
+    "num_minibatches": 4,
+    "learning_rate": 3e-3,
+    "gamma": 1.0,
+    "memory_noise": "0:0.1 1:0",
+    "log_std": "0:-0.7 0.3:-1.7 1:-5",
+    "log_radius": "0:2.5 0.5:0",
+}
+OWN_WITH_ONE_START = {**OWN, "total_updates": 500, "num_envs": 64, "flights_per_start": 64}
+OWN_WITH_STARTS = {**OWN, "total_updates": 200, "num_envs": 256, "flights_per_start": 16}
 
 
 def recipe(args):
-    """What our recipe changes for the environments of `args`; an id without a recipe takes the first."""
-    return RECIPES.get(args.env_id, RECIPES[ENV_IDS[0]])
+    """What our recipe changes for the environments of `args`; a problem of your own takes one of two."""
+    problem = PROBLEMS.get(args.env_id)
+    own = OWN_WITH_ONE_START if problem and problem.has_one_flight else OWN_WITH_STARTS
+    return RECIPES.get(args.env_id, own)
 
 
 # Problem: input and action --------------------------------------------------------------------------------------------

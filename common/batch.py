@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import inspect
 from collections.abc import Callable
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -298,7 +299,7 @@ def make_batch(env_id: str, num_envs: int, **env_options) -> BatchedEnv:
 
     Raises BadInput where it is not derived from `BatchedEnv`, or an option that it does not take would hide something.
     """
-    entry = gym.spec(env_id).vector_entry_point
+    entry: Any = gym.spec(env_id).vector_entry_point
     taken = inspect.signature(load_env_creator(entry) if isinstance(entry, str) else entry).parameters
     takes_all = any(parameter.kind is inspect.Parameter.VAR_KEYWORD for parameter in taken.values())
     for name, value in env_options.items():

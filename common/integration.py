@@ -32,8 +32,11 @@ def falling_root(value, begin, end, until, evaluations=10):
         h = np.clip(high - f_high * (high - low) / (f_high - f_low), low, high)
         f = value(h)
         below = f <= 0
-        f_low = np.where(below & (last == 1), f_low * f_high / (f_high + f), f_low)
-        f_high = np.where(~below & (last == -1), f_high * f_low / (f_low + f), f_high)
+        with np.errstate(divide="ignore", invalid="ignore"):  # where it is not used
+            lighter_low = f_low * f_high / (f_high + f)
+            lighter_high = f_high * f_low / (f_low + f)
+        f_low = np.where(below & (last == 1), lighter_low, f_low)
+        f_high = np.where(~below & (last == -1), lighter_high, f_high)
         high = np.where(below, h, high)
         f_high = np.where(below, np.minimum(f, -1e-300), f_high)
         low = np.where(below, low, h)

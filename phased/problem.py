@@ -228,7 +228,7 @@ class Problem:
 
     def state_weights(self, phase: Phase) -> tuple[float, ...]:
         """Q of each state; 0 where it has no target."""
-        if phase.target is None:
+        if phase.target is None or phase.Q is None:
             return (0.0,) * self.states
         return tuple(0.0 if target is None else weight for weight, target in zip(phase.Q, phase.target))
 
@@ -254,7 +254,7 @@ class Problem:
             d = [di / r for di, r in zip(d, phase.radius)]
         return np.hypot.reduce(np.array(d), axis=0)
 
-    def with_parameters(self, function: Callable, p) -> Callable:
+    def with_parameters(self, function, p) -> Callable:
         """A function of the table as one that does not take the hidden parameters p."""
         if self.parameters is None:
             return function

@@ -1,5 +1,6 @@
 """The pages: their links, tables and commands, and the front page's numbers against the results."""
 
+import dataclasses
 import importlib
 import itertools
 import json
@@ -200,17 +201,38 @@ def test_the_memorys_table_is_that_of_the_results():
             ], name
 
 
-def test_the_front_page_s_problem_is_solved(new_problem):
+def test_the_front_page_s_problem_is_solved(new_problem, monkeypatch):
     """Its table as printed: an environment of its own, and an optimum that hits both circles."""
     (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), flags=re.DOTALL)
-    names = {"Problem": envs.Problem, "Phase": envs.Phase}
+    monkeypatch.setattr(envs, "register_problem", new_problem)
+    names = {}
     exec(code, names)
-    env_id = new_problem(names["DUFFING"])
+    env_id = names["DUFFING"].env_id
     x0 = baselines.starts(0, 5, names["DUFFING"].x0_max)
     assert baselines.reference(env_id, x0)["hit"].all()
     x = envs.fly(env_id, lambda obs, t: np.zeros((5, 1)), x0)["x"]  # without control the damped spring loses energy
     energy = x[..., 1] ** 2 / 2 - x[..., 0] ** 2 / 2 + x[..., 0] ** 4 / 4
     assert (np.diff(energy, axis=1) < 0).all()
+
+
+def test_the_page_s_problem_is_that_of_the_folder(new_problem, monkeypatch):
+    """The table of docs/own-problem.md as printed, flown beside problems/goddard.py."""
+    code, _ = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "own-problem.md").read_text(), flags=re.DOTALL)
+    made = []
+    monkeypatch.setattr(envs, "register_problem", lambda table: made.append(new_problem(table)))
+    exec(code, {})
+    thrust = np.random.default_rng(0).uniform(0, 3.5, (60, 1, 1))
+    x0 = np.array([[0.0, 0.0, 1.0]])
+    printed, shipped = (envs.fly(env_id, lambda obs, t: thrust[t], x0) for env_id in (made[0], "Goddard-v0"))
+    for key, value in printed.items():
+        np.testing.assert_array_equal(value, shipped[key])
+
+
+def test_every_field_of_a_table_is_on_its_page():
+    page = (ROOT / "docs" / "own-problem.md").read_text()
+    for table in (envs.Problem, envs.Phase):
+        for field in dataclasses.fields(table):
+            assert f"`{field.name}`" in page, field.name
 
 
 @pytest.mark.slow
