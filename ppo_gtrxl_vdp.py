@@ -137,6 +137,10 @@ RECIPES = {
 }
 OWN = {  # a problem of your own: flights are compared from the first update on, which makes its units indifferent
     **OURS,
+    "num_blocks": 2,  # the rocket's network, half as wide as Table 1's
+    "embed_dim": 64,
+    "mlp_dim": 64,
+    "hidden_dim": 64,
     "gae_lambda": 1.0,
     "update_epochs": 4,
     "num_minibatches": 4,
