@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 
 import baselines
-from baselines import box_qp, fly_solution, hermite_simpson, lqr, lqr_policy, optimise, reference
+from baselines import box_qp, fly_solution, lqr, lqr_policy, optimise, reference
 from common import files
 from common.errors import BadInput
 from common.ipopt import interruptible
 from common.tasks import env_ids, task_of
 from envs import DOUBLE_INTEGRATOR, PROBLEMS, VAN_DER_POL, Phase, Problem, double_integrator, fly
+from phased.optimum import guesses, hermite_simpson
 
 ROOT = Path(__file__).resolve().parents[1]
 KEYS = {"x", "u", "reward", "episodic_return", "cost", "cost_state", "cost_control", "cost_terminal", "hit"}
@@ -341,7 +342,7 @@ def test_guesses_that_diverge_are_left_out(new_problem):
     cubed = lambda x, u: (x[1], x[1] ** 3 + u)  # noqa: E731
     phases = (Phase(steps=20, target=(0.0, 0.0), radius=0.05, R=0.1, Qf=20.0, bonus=20.0),)
     env_id = new_problem(Problem("Diverges-v0", cubed, 0.1, phases, x_max=(100.0, 50.0)))
-    count = lambda x0: len(list(baselines.guesses(PROBLEMS[env_id], np.array(x0), np.zeros(0))))  # noqa: E731
+    count = lambda x0: len(list(guesses(PROBLEMS[env_id], np.array(x0), np.zeros(0))))  # noqa: E731
     assert count([0.0, 4.0]) == 2
     assert count([0.1, -0.1]) == 4
 
@@ -363,7 +364,7 @@ def test_guesses_are_of_the_start_alone(new_problem):
 def test_single_optimum_is_a_promise_that_is_kept(new_problem, built_in, in_circles):
     """More guesses find nothing better for the problems of the paper."""
     env_id = new_problem(replace(PROBLEMS[built_in], env_id=f"Again-{in_circles}-{built_in}", single_optimum=False))
-    count = lambda name: len(list(baselines.guesses(PROBLEMS[name], np.ones(2), np.zeros(0))))  # noqa: E731
+    count = lambda name: len(list(guesses(PROBLEMS[name], np.ones(2), np.zeros(0))))  # noqa: E731
     assert count(built_in) == 1 < count(env_id)
     x0 = np.vstack([starts(2), [[1.0, 1.0]]])
     _, one, feasible, _ = optimise(built_in, x0, in_circles=in_circles)

@@ -22,6 +22,7 @@ from common.errors import BadInput, NoOptimum
 from common.integration import falling_root
 from common.tasks import task_of
 from envs import PROBLEMS, Phase, Problem, fly
+from phased import optimum as phased_optimum
 from phased.problem import flights_of_seed
 from problems.cart_pole import CART_POLE, cart_pole
 from problems.goddard import GODDARD
@@ -365,11 +366,11 @@ def test_cart_pole_by_two_transcriptions(new_problem):
     one = replace(kelly, env_id="KellyLine-v0")
     new_problem(one)
     x0, draw = flights_of_seed(one, 0, 1)
-    job = baselines.Job(one.env_id, baselines.shooting, True, 0, x0[0], draw[0])
-    line = list(baselines.guesses(one, x0[0], draw[0]))[1]
-    coarse = baselines.solve_on(one, baselines.Mesh.of(one), job, line)
-    sketches = baselines.sketches_of(one, coarse.mesh, x0[0], coarse.unknowns)
-    fine = baselines.solve_on(one, coarse.mesh.refined(4), job, sketches)
+    job = phased_optimum.Job(one.env_id, phased_optimum.shooting, True, 0, x0[0], draw[0])
+    line = list(phased_optimum.guesses(one, x0[0], draw[0]))[1]
+    coarse = phased_optimum.solve_on(one, phased_optimum.Mesh.of(one), job, line)
+    sketches = phased_optimum.sketches_of(one, coarse.mesh, x0[0], coarse.unknowns)
+    fine = phased_optimum.solve_on(one, coarse.mesh.refined(4), job, sketches)
     assert fine.succeeded and fine.cost == pytest.approx(58.82, abs=0.03)
 
 

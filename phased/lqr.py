@@ -1,0 +1,92 @@
+"""Linear-quadratic optimum of costs by weights: the finite-horizon discrete LQR about the targets."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from phased.problem import Phase, Problem
+
+
+def linearise(problem: Problem, point=None, phase: Phase | None = None):
+    """A (n, n) and B (n, m) of x_{k+1} = A x_k + B u_k + const. about a point (the origin), for the environment's step.
+
+    The dynamics are those of a phase, the first unless given.
+
+    Central differences of fourth order, with a step that is a power of two: for a linear problem they are exact but for
+    rounding, and dynamics need not be analytic, as those with np.abs or np.interp are not.
+    """
+    n, m = problem.states, problem.controls
+    point = np.zeros(n) if point is None else np.asarray(point, dtype=float)
+    h = 2.0**-9
+    changes = np.hstack([k * h * np.eye(n + m) for k in (-2, -1, 1, 2)])  # (n + m, 4 (n + m)), a change a column
+    p = tuple(value[:1] for value in problem.hidden(np.zeros((1, problem.scores))))
+    x = tuple(point[:, None] + changes[:n])
+    after, _ = problem.step(phase or problem.phases[0], x, problem.as_control(changes[n:]), p, problem.dt)
+    far_below, below, above, far_above = np.split(np.array(after), 4, axis=1)
+    AB = (8 * (above - below) - (far_above - far_below)) / (12 * h)
+    return AB[:, :n], AB[:, n:]
+
+
+def riccati(problem: Problem):
+    """Finite-horizon discrete LQR by the backward Riccati recursion (e.g. Anderson and Moore, Optimal Control, 1990).
+
+    The dynamics are linearised about each phase's target x*, which need not be at rest: with d = x - x* the control is
+    u_t = -K_t d_t - k_t and the cost to go d'P_t d + 2 p_t'd + const. A state without a target has no weight, and 0 in
+    place of it. Returns K (T, m, n), k (T, m) and P (T+1, n, n). Raises ValueError where costs are not by weights.
+    """
+    if not problem.weighted or problem.has_events:
+        raise ValueError(f"{problem.env_id} has costs by functions, or events; LQR is for weights and fixed times")
+    n, m, T = problem.states, problem.controls, problem.steps
+    K, k, P, p = np.empty((T, m, n)), np.empty((T, m)), np.zeros((T + 1, n, n)), np.zeros(n)
+    end, next_target = T, point_of(problem, problem.phases[-1])
+    for phase in reversed(problem.phases):
+        target = point_of(problem, phase)
+        A, B = linearise(problem, target, phase)
+        hidden = problem.hidden(np.zeros((1, problem.scores)))
+        rest, _ = problem.step(phase, tuple(target[:, None]), problem.as_control(np.zeros((m, 1))), hidden, problem.dt)
+        drift = np.array(rest)[:, 0] - target
+        p = p + P[end] @ (target - next_target)  # d is now the distance to this phase's target
+        aimed = [value is not None for value in problem.targets_of(phase)]
+        P[end] += phase.Qf * np.diag(np.array(aimed, dtype=float))
+        R = np.diag(problem.control_weights(phase))
+        for t in reversed(range(end - phase.steps, end)):
+            weight, ahead = R + B.T @ P[t + 1] @ B, P[t + 1] @ drift + p
+            K[t] = np.linalg.solve(weight, B.T @ P[t + 1] @ A)
+            k[t] = np.linalg.solve(weight, B.T @ ahead)
+            P[t] = np.diag(problem.state_weights(phase)) + A.T @ P[t + 1] @ (A - B @ K[t])
+            p = (A - B @ K[t]).T @ ahead
+        end, next_target = end - phase.steps, target
+    return K, k, P
+
+
+def point_of(problem: Problem, phase: Phase) -> np.ndarray:
+    """A phase's target (n,), with 0 for the states that have none."""
+    return np.array([target or 0.0 for target in problem.targets_of(phase)])
+
+
+def lqr(problem: Problem):
+    """The gains K (T, n) of u_t = -K_t x_t and P (T+1, n, n) with the cost to go x'P_t x, by `riccati`; of one control.
+
+    Exact for the double integrator without its bound; for Van der Pol the linearisation about the origin. Raises
+    ValueError on waypoints.
+    """
+    if problem.waypoints:
+        raise ValueError(f"{problem.env_id} has {len(problem.phases)} phases; LQR is for problems with 1")
+    K, _, P = riccati(problem)
+    return K[:, 0], P
+
+
+def targets(problem: Problem) -> np.ndarray:
+    """The target of each step's phase, (T, n)."""
+    points = [point_of(problem, phase) for phase in problem.phases]
+    return np.repeat(points, [phase.steps for phase in problem.phases], axis=0)
+
+
+def lqr_policy(problem: Problem) -> Callable:
+    """LQR about the targets, clipped at the control bounds, as a policy for `envs.fly`."""
+    K, k, _ = riccati(problem)
+    target, (low, high) = targets(problem), problem.u_box
+    n = problem.states
+    return lambda obs, t: np.clip(-(obs[:, :n] - target[t]) @ K[t].T - k[t], low, high)

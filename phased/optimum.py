@@ -1,0 +1,421 @@
+"""The optimum of a table by IPOPT: states and held controls of every step are unknowns, the dynamics constraints.
+
+Reading order: meshes and transcriptions ("defects"), the program, guesses, solutions. `baselines.py` flies what is
+found here. CasADi is imported only where it is used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+
+from common.errors import BadInput, NoOptimum
+from common.ipopt import interruptible, limit
+from phased.environment import fly
+from phased.lqr import lqr_policy
+from phased.problem import PROBLEMS, Phase, Problem
+
+FIRST_STEPS = 40  # of a phase with an event, at most, until its length is known
+HELD_TRIES = 4  # other numbers of steps, once it is
+
+
+class Mesh(NamedTuple):
+    """The steps into which a program cuts each phase.
+
+    A phase of fixed time has steps of dt / `refine`. One that ends by an event has one length h as an unknown: of its
+    last step, behind steps of dt as the environment flies them, or with `stretched` of all its steps.
+    """
+
+    counts: tuple[int, ...]
+    stretched: bool = False
+    refine: int = 1
+
+    @classmethod
+    def of(cls, problem: Problem) -> Mesh:
+        """That of a problem without events, or the first one with events, which finds out how long the phases are."""
+        counts = (phase.steps if phase.end is None else min(phase.steps, FIRST_STEPS) for phase in problem.phases)
+        return cls(tuple(counts), problem.has_events)
+
+    def refined(self, factor: int) -> Mesh:
+        """One of shorter steps."""
+        return Mesh(tuple(count * factor for count in self.counts), True, factor)
+
+
+def shooting(problem: Problem, phase: Phase, x, u, p, h, x_next):
+    """Defect of multiple shooting, x_{k+1} - step(x_k, u_k), with the environment's own step; and the running cost."""
+    after, running = problem.step(phase, x, u, p, h)
+    return tuple(b - a for a, b in zip(after, x_next)), running
+
+
+def hermite_simpson(problem: Problem, phase: Phase, x, u, p, h, x_next):
+    """Defect of direct collocation: a cubic through both ends that obeys x' = f(x, u) at mid-step, control held.
+
+    Hargraves and Paris (1987), in the compressed form of Betts, Practical Methods for Optimal Control, section 4.5; the
+    running cost by Simpson's rule.
+    """
+    f = problem.with_parameters(phase.f or problem.f, p)
+    dx, dx_next = f(x, u), f(x_next, u)
+    x_mid = tuple((a + b) / 2 + h / 8 * (da - db) for a, b, da, db in zip(x, x_next, dx, dx_next))
+    dx_mid = f(x_mid, u)
+    defects = tuple(b - a - h / 6 * (da + 4 * dm + db) for a, b, da, dm, db in zip(x, x_next, dx, dx_mid, dx_next))
+    if phase.running is None:
+        return defects, 0.0
+    running = problem.with_parameters(phase.running, p)
+    return defects, h / 6 * (running(x, u) + 4 * running(x_mid, u) + running(x_next, u))
+
+
+def program(problem: Problem, mesh: Mesh, defect: Callable, in_circles: bool):
+    """The nonlinear program as CasADi symbols, and the bounds of its constraints: (symbols, lbg, ubg).
+
+    Unknowns: the controls u_0..u_{T-1}, m each, the states x_1..x_T, n each, and the lengths h of `Mesh`. Parameters:
+    x_0 and the hidden ones. Cost: J of `phased/environment.py` (the paper's "J", summed by us). Constraints: the
+    defects (n T of them, = 0); with `in_circles` the sum of (dx / r)^2 at each phase's end (<= 1); where a phase ends
+    by an event its value there (= 0) and before (>= 0); the square of a bounded norm.
+    """
+    import casadi as ca
+
+    ca.GlobalOptions.setNumpyMode(1)  # np.sin of a symbol is a symbol, without the warning that it was not always so
+    n, m, T = problem.states, problem.controls, sum(mesh.counts)
+    hidden = len(problem.hidden(np.zeros((1, problem.scores))))
+    x0, p = ca.SX.sym("x0", n), ca.SX.sym("p", hidden)
+    u, x = ca.SX.sym("u", m, T), ca.SX.sym("x", n, T)
+    h = ca.SX.sym("h", sum(phase.end is not None for phase in problem.phases))
+    parameters, lengths = tuple(ca.vertsplit(p)), iter(ca.vertsplit(h))
+    state, t, cost, defects, circles, events, norms = tuple(ca.vertsplit(x0)), 0, 0, [], [], [], []
+    for phase, count in zip(problem.phases, mesh.counts):
+        dt = problem.dt / mesh.refine
+        length = dt if phase.end is None else next(lengths)
+        for step in range(count):
+            is_last = step == count - 1
+            seconds = length if is_last or mesh.stretched else dt
+            state_next = tuple(x[k, t] for k in range(n))
+            controls = [u[k, t] for k in range(m)]
+            share = seconds / problem.dt
+            aims = zip(problem.state_weights(phase), state, problem.targets_of(phase))
+            cost += share * sum(q * (xi - target) ** 2 for q, xi, target in aims if target is not None)
+            cost += share * sum(r * ui**2 for r, ui in zip(problem.control_weights(phase), controls))
+            control = problem.as_control(controls)
+            gaps, running = defect(problem, phase, state, control, parameters, seconds, state_next)
+            cost += running
+            defects += gaps
+            if phase.end is not None:
+                events.append((problem.with_parameters(phase.end, parameters)(state_next), is_last))
+            if problem.u_norm is not None:
+                norms.append(sum(ui**2 for ui in controls))
+            state, t = state_next, t + 1
+        d = problem.distances(phase, state)
+        cost += phase.Qf * sum(di**2 for di in d)
+        if phase.terminal is not None:
+            cost += problem.with_parameters(phase.terminal, parameters)(state)
+        if phase.has_circle:
+            circles.append(sum((di / r) ** 2 for di, r in zip(d, problem.radii(phase))))
+    circles = circles if in_circles else []
+    g = ca.vertcat(*defects, *circles, *(value for value, _ in events), *norms)
+    least, greatest = problem.u_norm or (0.0, 0.0)
+    low = [0.0] * len(defects) + [-np.inf] * len(circles) + [0.0] * len(events) + [least**2] * len(norms)
+    high = [0.0] * len(defects) + [1.0] * len(circles)
+    high += [0.0 if is_last else np.inf for _, is_last in events] + [greatest**2] * len(norms)
+    symbols = {"x": ca.vertcat(ca.vec(u), ca.vec(x), h), "p": ca.vertcat(x0, p), "f": cost, "g": g}
+    return symbols, np.array(low), np.array(high)
+
+
+@cache
+def solver(problem: Problem, mesh: Mesh, defect: Callable, in_circles: bool):
+    """IPOPT for `program`, built once per process: its CasADi function and the arguments that no start changes."""
+    import casadi as ca
+
+    options = {
+        "expand": True,
+        "print_time": False,
+        "ipopt.print_level": 0,
+        "ipopt.sb": "yes",
+        "ipopt.tol": 1e-10,
+        "ipopt.bound_relax_factor": 0,  # the default lets solutions end 2.5e-7 outside their circle
+        "ipopt.max_wall_time": limit["seconds"],
+    }
+    T = sum(mesh.counts)
+    (u_low, u_high), (x_low, x_high) = problem.u_box, problem.limits
+    longest = []
+    for phase, count in zip(problem.phases, mesh.counts):
+        if phase.end is not None:
+            longest.append(problem.dt * phase.steps / count if mesh.stretched else problem.dt)
+    shortest = 1e-6 * np.array(longest) if mesh.stretched else np.zeros(len(longest))
+    try:
+        symbols, lbg, ubg = program(problem, mesh, defect, in_circles)
+    except Exception as error:  # a user's function can fail in any way on symbols
+        raise NoOptimum(why_no_symbols(problem, error)) from error
+    arguments = {
+        "lbx": np.concatenate([np.tile(u_low, T), np.tile(x_low, T), shortest]),
+        "ubx": np.concatenate([np.tile(u_high, T), np.tile(x_high, T), longest]),
+        "lbg": lbg,
+        "ubg": ubg,
+    }
+    return ca.nlpsol("optimum", "ipopt", symbols, options), arguments
+
+
+def why_no_symbols(problem: Problem, error: Exception) -> str:
+    """One line on what CasADi cannot take in a table's functions."""
+    if "truth value" in str(error):
+        allowed = "no `if`, `min` or `max` of Python, but NumPy's `where`, `minimum` and `maximum`"
+        return f"the dynamics of {problem.env_id} decide by a value; they may hold {allowed}"
+    first = next(iter(str(error).strip().splitlines()), "")
+    allowed = "arithmetic and NumPy's functions of one state at a time; a matrix product has to be written out"
+    return f"the functions of {problem.env_id} fail on CasADi's symbols ({first:.100}); they may hold {allowed}"
+
+
+class Sketch(NamedTuple):
+    """A guess or solution of a phase, whatever its steps: controls (K, m) held between the states (K+1, n), seconds."""
+
+    u: np.ndarray
+    x: np.ndarray
+    seconds: float
+
+
+def lasting(times: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """The controls u (K, m), each held for a K-th of the time 0 to 1, at the middle of the steps between `times`."""
+    middle = (times[:-1] + times[1:]) / 2
+    return u[np.minimum((middle * len(u)).astype(int), len(u) - 1)]
+
+
+def placed(problem: Problem, mesh: Mesh, sketches: list[Sketch]) -> np.ndarray:
+    """The unknowns of a mesh, as the sketches of the phases have them."""
+    controls, states, lengths = [], [], []
+    for phase, count, sketch in zip(problem.phases, mesh.counts, sketches):
+        times = np.linspace(0, 1, count + 1)
+        if phase.end is not None and not mesh.stretched:  # whole steps, and a last one
+            times = np.minimum(np.arange(count + 1) * problem.dt / sketch.seconds, 1.0)
+            times[-1] = 1.0
+        controls.append(lasting(times, sketch.u))
+        own_times = np.linspace(0, 1, len(sketch.x))
+        states.append(np.column_stack([np.interp(times[1:], own_times, row) for row in sketch.x.T]))
+        if phase.end is not None:
+            last = np.clip(sketch.seconds - problem.dt * (count - 1), 0.0, problem.dt)
+            lengths.append(sketch.seconds / count if mesh.stretched else last)
+    return np.concatenate([np.vstack(controls).ravel(), np.vstack(states).ravel(), lengths])
+
+
+def sketches_of(problem: Problem, mesh: Mesh, x0, solution: np.ndarray) -> list[Sketch]:
+    """The unknowns of a solution by phase; `placed` turns them into those of another mesh."""
+    T, n, m = sum(mesh.counts), problem.states, problem.controls
+    u, x = solution[: m * T].reshape(T, m), np.vstack([x0, solution[m * T : (m + n) * T].reshape(T, n)])
+    lengths = iter(solution[(m + n) * T :])
+    sketches, begin = [], 0
+    for phase, count in zip(problem.phases, mesh.counts):
+        seconds = problem.dt * count / mesh.refine
+        if phase.end is not None:
+            h = next(lengths)
+            seconds = h * count if mesh.stretched else problem.dt * (count - 1) + h
+        sketches.append(Sketch(u[begin : begin + count], x[begin : begin + count + 1], seconds))
+        begin += count
+    return sketches
+
+
+def guess_policies(problem: Problem) -> list[Callable]:
+    """The feedback laws whose flights are guesses.
+
+    With costs by weights LQR about the targets, and full control along the velocity, which adds most energy, wherever
+    that LQR saturates (for two states and one control). With others the middle of the set of controls and its ends, or
+    the table's own law.
+    """
+    low, high = problem.u_box
+    if problem.guess is not None:
+        return [law_of(problem, problem.guess)]
+    if not problem.weighted or problem.has_events:
+        constants = [problem.u_centre, high, low]
+        if problem.u_norm is not None:
+            constants = [np.eye(problem.controls)[-1] * size for size in problem.u_norm]
+        return [lambda obs, t, u=u: np.tile(u, (len(obs), 1)) for u in constants]
+    near = lqr_policy(problem)
+    if problem.states > 2 or problem.controls > 1:
+        return [near]
+
+    def pump(obs, t):
+        u = near(obs, t)
+        return np.where(np.abs(u) < problem.u_max, u, problem.u_max * np.sign(obs[:, 1:2]))
+
+    return [near, pump]
+
+
+def law_of(problem: Problem, law: Callable) -> Callable:
+    """A feedback law u = law(x) of the table as a policy for `envs.fly`."""
+
+    def policy(obs, t):
+        controls = law(tuple(obs[:, : problem.states].T))
+        rows = controls if isinstance(problem.u_max, tuple) else (controls,)
+        return np.column_stack([np.broadcast_to(row, len(obs)) for row in rows])
+
+    return policy
+
+
+def guesses(problem: Problem, x0, draw):
+    """Where IPOPT begins from the start x0 (n,): yields the sketches of the phases.
+
+    The first rests on the targets in the middle of the set of controls, which is all with `Problem.single_optimum`.
+    Otherwise more: straight lines from the start to the targets, and the flights of `guess_policies` that do not
+    diverge. A guess is the start's own, so that a solution depends neither on its neighbours nor on how the starts are
+    shared out.
+
+    Chosen on pendulums x2' = sin x1 + u swung up with |u| <= 0.2 to 0.3, 20 starts each. Over 10 to 15 s the first
+    guess ended above the best of the four at up to 5 % of the starts, with up to 1.46 of their sum of costs; over 20 s
+    it failed at 85 %, the two flights at none. They take less time than the first two. Full control of either sign, no
+    control, and full control against the velocity added little. The best of four can still be a local optimum.
+    """
+    corners = [np.asarray(x0, dtype=float)]
+    for phase in problem.phases:
+        aims = zip(problem.targets_of(phase), corners[-1])
+        corners.append(np.array([before if target is None else target for target, before in aims]))
+    middle = problem.u_centre
+    if problem.u_norm is not None:
+        middle = np.eye(problem.controls)[-1] * np.mean(problem.u_norm)
+
+    def resting(phase, x):
+        share = 0.5 if phase.end is not None else 1.0  # of the longest time
+        return Sketch(np.tile(middle, (phase.steps, 1)), x, share * phase.steps * problem.dt)
+
+    yield [resting(phase, np.tile(end, (phase.steps + 1, 1))) for phase, end in zip(problem.phases, corners[1:])]
+    if problem.single_optimum:
+        return
+    lines = zip(problem.phases, corners[:-1], corners[1:])
+    yield [resting(phase, np.linspace(begin, end, phase.steps + 1)) for phase, begin, end in lines]
+    for policy in guess_policies(problem):
+        with suppress(BadInput), np.errstate(all="ignore"):  # a state that overflows gives an action that is refused
+            sketches = flown_sketches(problem, policy, x0, draw)
+            if sketches is not None:
+                yield sketches
+
+
+def flown_sketches(problem: Problem, policy, x0, draw) -> list[Sketch] | None:
+    """The flight of a policy as sketches; None where it diverges, or has events and several phases."""
+    flight = fly(problem.env_id, policy, x0[None], draw[None])
+    x, u = flight["x"][0], flight["u"][0].reshape(problem.steps, problem.controls)
+    if problem.has_events:
+        flown = int(np.isfinite(u).all(axis=1).sum())
+        beyond = np.abs(x[: flown + 1]) > problem.x_max
+        if problem.waypoints or not flown or beyond.any():
+            return None
+        return [Sketch(u[:flown], x[: flown + 1], float(flight["final_time"][0]))]
+    if not (np.isfinite(x).all() and np.isfinite(u).all()):
+        return None
+    ends = [0, *problem.phase_ends]
+    pieces = zip(ends[:-1], ends[1:])
+    return [Sketch(u[a:b], x[a : b + 1], (b - a) * problem.dt) for a, b in pieces]
+
+
+class Job(NamedTuple):
+    """A start to be solved; it holds all that a process needs."""
+
+    env_id: str
+    defect: Callable
+    in_circles: bool
+    index: int
+    x0: np.ndarray
+    draw: np.ndarray
+
+
+class Solution(NamedTuple):
+    """What IPOPT found on a mesh; `status` is IPOPT's."""
+
+    mesh: Mesh
+    unknowns: np.ndarray
+    cost: float
+    multipliers: np.ndarray  # of the circles
+    bound_price: float  # the least `Problem.bound_price` with which crossing a bound does not pay
+    status: str
+
+    @property
+    def succeeded(self) -> bool:
+        return self.status in ("Solve_Succeeded", "Solved_To_Acceptable_Level")
+
+
+def solve_on(problem: Problem, mesh: Mesh, job: Job, sketches: list[Sketch]) -> Solution:
+    """Solve from a guess."""
+    solve, arguments = solver(problem, mesh, job.defect, job.in_circles)
+    p = [float(value[0]) for value in problem.hidden(job.draw[None])]
+    found = solve(p=np.concatenate([job.x0, p]), x0=placed(problem, mesh, sketches), **arguments)
+    begin = problem.states * sum(mesh.counts)
+    circles = sum(phase.has_circle for phase in problem.phases) if job.in_circles else 0
+    multipliers = found["lam_g"].full()[begin : begin + circles, 0]
+    status = solve.stats()["return_status"]
+    unknowns = found["x"].full()[:, 0]
+    first = problem.controls * sum(mesh.counts)
+    of_states = found["lam_x"].full()[first : first + begin, 0].reshape(-1, problem.states)
+    bound_price = float((np.abs(of_states) * problem.scale).max() / problem.dt * mesh.refine)
+    return Solution(mesh, unknowns, float(found["f"]), multipliers, bound_price, status)
+
+
+def held_steps(problem: Problem, job: Job, stretched: Solution) -> Solution:
+    """The solution in the environment's own steps, from one that has found out how long the phases are.
+
+    The number of steps is that of the stretched solution. Where the last step of a phase ends at 0 or dt, a neighbour
+    may be better, and is tried.
+    """
+    sketches = sketches_of(problem, stretched.mesh, job.x0, stretched.unknowns)
+
+    def steps_of(sketch, phase):
+        whole = int(np.ceil(sketch.seconds / problem.dt - 1e-9))
+        return phase.steps if phase.end is None else min(max(whole, 1), phase.steps)
+
+    mesh = Mesh(tuple(steps_of(sketch, phase) for sketch, phase in zip(sketches, problem.phases)))
+    best = solve_on(problem, mesh, job, sketches)
+    for _ in range(HELD_TRIES):
+        sketches = sketches_of(problem, best.mesh, job.x0, best.unknowns)
+        counts = list(best.mesh.counts)
+        for k, (phase, sketch) in enumerate(zip(problem.phases, sketches)):
+            if phase.end is not None and best.succeeded:
+                last = sketch.seconds / problem.dt - (counts[k] - 1)
+                counts[k] = min(max(counts[k] + (last > 1 - 1e-4) - (last < 1e-4), 1), phase.steps)
+            elif phase.end is not None:
+                counts[k] = min(counts[k] + 1, phase.steps)  # held steps need more time than stretched ones
+        if tuple(counts) == best.mesh.counts:
+            break
+        other = solve_on(problem, Mesh(tuple(counts)), job, sketches)
+        if other.succeeded and not (best.succeeded and best.cost <= other.cost):
+            best = other
+        elif best.succeeded:
+            break
+    return best
+
+
+@interruptible()
+def best_solution(job: Job) -> tuple[Solution, bool]:
+    """The best solution of a start's guesses in the environment's steps, and whether it is one."""
+    problem = PROBLEMS[job.env_id]
+    mesh = Mesh.of(problem)
+    found: list[Solution] = []
+    for guess in guesses(problem, job.x0, job.draw):
+        solution = solve_on(problem, mesh, job, guess)
+        if solution.succeeded and problem.has_events:
+            solution = held_steps(problem, job, solution)
+        found.append(solution)
+    solved = [solution for solution in found if solution.succeeded]
+    statuses = dict.fromkeys(solution.status for solution in found)
+    # circles, bounds and events can be out of reach: without them every control has its trajectory
+    can_be_infeasible = job.in_circles or problem.bounds or problem.has_events
+    if not solved and not (can_be_infeasible and "Infeasible_Problem_Detected" in statuses):
+        where = f"start {job.index}, x0 = {job.x0.tolist()}, of {job.env_id}"
+        raise NoOptimum(f"{where}: IPOPT stopped with {', '.join(statuses)}{why_it_stopped(statuses)}")
+    return min(solved, key=lambda solution: solution.cost, default=found[0]), bool(solved)
+
+
+@interruptible()
+def refined(job: Job, best: Solution, factor: int) -> Solution:
+    """The solution of a start with steps that are `factor` times shorter, by the job's defect, from its best one."""
+    problem = PROBLEMS[job.env_id]
+    sketches = sketches_of(problem, best.mesh, job.x0, best.unknowns)
+    return solve_on(problem, best.mesh.refined(factor), job, sketches)
+
+
+def why_it_stopped(statuses) -> str:
+    """The usual cause of a solve that does not end."""
+    if "Maximum_Iterations_Exceeded" in statuses or "Restoration_Failed" in statuses:
+        return (
+            " (the usual cause: a function with a step or kink, as np.sign, np.clip or np.abs, or one that is NaN in"
+            " the branch of np.where that is not taken)"
+        )
+    if "Maximum_WallTime_Exceeded" in statuses:
+        return f" (after {limit['seconds']:g} s; --solve-seconds gives it more)"
+    return ""
