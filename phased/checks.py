@@ -117,7 +117,8 @@ def check_rows(problem, n: int, n_states: str):
     for name, count in (("x_names", n), ("u_names", problem.controls)):
         names = getattr(problem, name)
         possible = names is None or (is_tuple_of(lambda word: isinstance(word, str), names) and len(names) == count)
-        refuse(problem, possible, name, names, f"must be {count} words")
+        each = "state (x_max" if name == "x_names" else "control (u_max"
+        refuse(problem, possible, name, names, f"must be a tuple of words, {count}: one for each {each} has {count})")
     hidden = problem.velocities
     possible = hidden is None or is_tuple_of(lambda k: isinstance(k, int) and 0 <= k < n, hidden)
     refuse(problem, possible, "velocities", hidden, f"must be numbers of states, 0 to {n - 1}")
@@ -128,6 +129,12 @@ def check_rows(problem, n: int, n_states: str):
         refuse(
             problem, positive(problem.bound_price), "bound_price", problem.bound_price, "must be positive with bounds"
         )
+        low, high = problem.limits
+        if not callable(problem.x0):
+            centre = np.zeros(n) if problem.x0 is None else np.array(problem.x0)
+            half = np.array(problem.x0_max)
+            holds = (centre - half >= low).all() and (centre + half <= high).all()
+            refuse(problem, holds, "bounds", bounds, f"must hold the starts, {centre.tolist()} +- {problem.x0_max}")
 
 
 def check_phase(problem, phase, k: int):
@@ -144,6 +151,8 @@ def check_phase(problem, phase, k: int):
     target = phase.target
     possible = target is None or (is_tuple_of(number_or_none, target) and len(target) == n)
     check(possible, "target", f"must be {n} numbers or None, one for each state (x_max has {n})")
+    beyond = any(value is not None and abs(value) > most for value, most in zip(target or (), problem.x_max))
+    check(not beyond, "target", f"must be within x_max {problem.x_max}")
     aimed = sum(value is not None for value in problem.targets_of(phase))
     is_radius = lambda value: isinstance(value, int | float) and value > 0  # noqa: E731
     possible = is_radius(phase.radius) or (is_tuple_of(is_radius, phase.radius) and len(phase.radius) == aimed)
@@ -197,7 +206,10 @@ def try_functions(problem):
             if callable(function):
                 field = f"{name} of phase {k}"
                 value = attempt(problem, field, problem.with_parameters(function, p), *arguments)
-                as_rows(problem, field, (value,))
+                rows = as_rows(problem, field, (value,))
+                above = name != "end" or k > 1 or (rows[0] >= 0).all()
+                allowed = "must not be below 0 at the starts: the phase ends when it falls through 0"
+                refuse_unless(above, f"{field} of {problem.env_id}", f"{np.min(rows[0]):.6g} at a start", allowed)
         check_step(problem, phase, x, u, p)
 
 
@@ -220,6 +232,7 @@ HINTS = (  # a part of an error's message -> its usual cause
     ("only size-1", "`math`'s functions take one number; it must use NumPy's, as np.sin"),
     ("broadcast", "arrays of different shapes meet; a matrix product must be written out by components"),
     ("matmul", "arrays of different shapes meet; a matrix product must be written out by components"),
+    ("unpack", "its tuples have other lengths; u is one number where u_max is one, and a tuple where it is a tuple"),
     ("read-only", "it changes its arguments in place; it must return new values"),
 )
 
@@ -251,7 +264,7 @@ def as_rows(problem, field: str, values) -> tuple:
         try:
             row = np.broadcast_to(np.asarray(value, dtype=np.float64), TRIALS)
         except (TypeError, ValueError) as error:
-            allowed = "must be one number for each flight"
+            allowed = "must be one number for each flight (a control is a tuple where u_max is one)"
             refuse_unless(False, f"what {field} of {problem.env_id} returns", one_line(value), allowed)
             raise AssertionError from error
         allowed = f"must be finite at the starts: {one_line(row.tolist())}"

@@ -49,7 +49,7 @@ def trajectories_figure(problem: Problem, arrays: dict, title: str) -> Figure:
     control.set(xlabel="time (s)", ylabel=problem.control_labels[0], title=f"Control (bounds {bounds})")
     for ax in figure.axes:
         ax.grid(alpha=0.3)
-    figure.suptitle(f"{title}\nthe first {len(arrays['x'][:SHOWN])} starts")
+    figure.suptitle(title if problem.has_one_flight else f"{title}\nthe first {len(arrays['x'][:SHOWN])} starts")
     add_legend(figure, problem)
     return figure
 
@@ -73,7 +73,7 @@ def time_figure(problem: Problem, arrays: dict, title: str) -> Figure:
     for ax in panels[len(labels) :]:
         ax.set_axis_off()
     mark_table(problem, panels)
-    figure.suptitle(f"{title}\nthe first {len(arrays['x'][:SHOWN])} starts")
+    figure.suptitle(title if problem.has_one_flight else f"{title}\nthe first {len(arrays['x'][:SHOWN])} starts")
     handles = [Line2D([], [], **POLICY, label="policy"), Line2D([], [], **OPTIMUM, label="optimum")]
     handles.append(Line2D([], [], **TARGET, linestyle="--", label="target"))
     handles.append(Line2D([], [], **BOUNDARY, label="bound, or end of a phase"))

@@ -13,7 +13,8 @@ def table(problem: Problem, metrics: dict) -> str:
     """
     rows = [("", "optimum", "ours", "ratio"), *cost_rows(problem, metrics), *hit_rows(problem, metrics)]
     width = max(len(label) for label, *_ in rows)
-    lines = [f"{metrics['env_id']}: {metrics['eval_starts']} starts of eval seed {metrics['eval_seed']}"]
+    starts = f"{metrics['eval_starts']} starts of eval seed {metrics['eval_seed']}"
+    lines = [f"{metrics['env_id']}: {'its one start' if problem.has_one_flight else starts}"]
     for label, *cells in rows:
         line = f"  {label:<{width}}" + "".join(f" {cell:>11}" for cell in cells)
         lines.append(line.rstrip())
@@ -25,7 +26,8 @@ def cost_rows(problem: Problem, metrics: dict) -> list[tuple]:
     all_compared = not problem.circles_count or metrics["hit_rate"] == metrics["reference_hit_rate"] == 1
     parts = {f"cost_{part}": f"  of it: {part}" for part in problem.parts}
     optimum, ours = metrics["reference_cost_mean"], metrics["cost_mean"]
-    rows = [row(f"cost J (mean of {metrics['eval_starts']} starts)", optimum, ours, metrics.get("ratio_of_sums"))]
+    of_starts = "" if problem.has_one_flight else f" (mean of {metrics['eval_starts']} starts)"
+    rows = [row(f"cost J{of_starts}", optimum, ours, metrics.get("ratio_of_sums"))]
     for part, label in parts.items():
         optimum, ours = metrics[f"reference_{part}_mean"], metrics[f"{part}_mean"]
         ratio = ours / optimum if all_compared and optimum > 0 else None
@@ -65,6 +67,8 @@ def ratio_lines(problem: Problem, metrics: dict) -> list[str]:
         reason = "no start hit every circle" if metrics["hit_rate"] == 0 else "where ours hit, the optimum does not"
         return [f"  No cost ratio: {reason} (missing a circle is cheaper, not better)."]
     over = "the starts that hit every circle" if problem.circles_count else f"all {metrics['eval_starts']} starts"
+    if problem.has_one_flight:
+        return [f"  Cost ratio ours / optimum: {metrics['ratio_of_sums']:.4f}"]
     lines = [f"  Cost ratio ours / optimum over {over}:"]
     lines.append(f"    mean {metrics['ratio_mean']:.4f}: the paper's statistic, a mean of ten starts, on average")
     draws = {key: metrics.get(f"ten_start_ratio_mean_{key}") for key in ("p05", "p50", "p95")}

@@ -100,6 +100,8 @@ class PhasedTask:
         if "ratio_of_sums" not in metrics:
             return f"{self.env_id}: no cost ratio, {metrics['hit_rate']:.1%} of the starts hit every circle"
         title = f"{self.env_id}: cost {metrics['ratio_of_sums']:.4f} x optimum"
+        if self.problem.has_one_flight:
+            return title
         if self.problem.circles_count:
             return f"{title} over the starts that hit every circle ({metrics['hit_rate']:.1%})"
         return f"{title} ({metrics['eval_starts']} starts)"

@@ -556,7 +556,7 @@ def test_every_id_and_every_short_name_is_a_command():
 
 
 @pytest.mark.parametrize("arguments, message", [
-    (["pendulum"], "invalid choice: 'pendulum'"),
+    (["pendulum"], "'pendulum' is no id here"),
     ([], "required: command"),
     (["van-der-pol", "--starts", "0"], "--starts: '0' must be a whole number from 1 to 100000"),
     (["van-der-pol", "--starts", "nan"], "--starts: 'nan' must be a whole number from 1 to 100000"),

@@ -16,8 +16,10 @@ import pytest
 import baselines
 import envs
 import runs
+from phased.problem import flights_of_seed
 
 ROOT = Path(__file__).resolve().parents[1]
+OWN_PROBLEM = ROOT / "docs" / "own-problem.md"
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
 PAGES += sorted((ROOT / "results").rglob("README.md"))  # they hold the commands of all results
 each_page = pytest.mark.parametrize("page", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
@@ -217,10 +219,19 @@ def test_the_front_page_s_problem_is_solved(new_problem, monkeypatch):
 
 def test_the_page_s_problem_is_that_of_the_folder(new_problem, monkeypatch):
     """The table of docs/own-problem.md as printed, flown beside problems/goddard.py."""
-    code, _ = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "own-problem.md").read_text(), flags=re.DOTALL)
-    made = []
+    code, boat, craft, _ = re.findall(r"```python\n(.*?)```", OWN_PROBLEM.read_text(), flags=re.DOTALL)
+    made, names = [], {}
     monkeypatch.setattr(envs, "register_problem", lambda table: made.append(new_problem(table)))
-    exec(code, {})
+    exec(code, names)
+    for more, name in ((boat, "BOAT"), (craft, "CRAFT")):
+        exec(more, names)
+        table = names[name]
+        x0, draw = flights_of_seed(table, 0, 1)
+        optimum = baselines.reference(new_problem(table), x0, draw=draw)
+        if name == "BOAT":  # Bryson and Ho, section 2.7: about 5.46 to the point itself; the circle saves some of it
+            assert 5.3 < optimum["final_time"][0] < 5.46
+        else:  # by minimum energy, 12 d^2 / T^3 of each axis
+            assert optimum["cost_running"][0] == pytest.approx(2 * 12 / 2**3, rel=0.05)
     thrust = np.random.default_rng(0).uniform(0, 3.5, (60, 1, 1))
     x0 = np.array([[0.0, 0.0, 1.0]])
     printed, shipped = (envs.fly(env_id, lambda obs, t: thrust[t], x0) for env_id in (made[0], "Goddard-v0"))
@@ -229,7 +240,7 @@ def test_the_page_s_problem_is_that_of_the_folder(new_problem, monkeypatch):
 
 
 def test_every_field_of_a_table_is_on_its_page():
-    page = (ROOT / "docs" / "own-problem.md").read_text()
+    page = OWN_PROBLEM.read_text()
     for table in (envs.Problem, envs.Phase):
         for field in dataclasses.fields(table):
             assert f"`{field.name}`" in page, field.name

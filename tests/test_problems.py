@@ -144,9 +144,7 @@ def test_bounds_have_a_price(new_problem):
     """A second at one scale beyond costs `bound_price`: held at 3 where 1 is allowed and the scale 0.5."""
     phase = Phase(steps=4, terminal=lambda x: 0.0 * x[0])
     table = {"bounds": ((None, 1.0), (-2.0, None)), "bound_price": 7.0, "x_scale": (0.5, 1.0)}
-    problem = Problem(
-        "Price-v0", lambda x, u: (0.0 * x[0], u), 5.0, (phase,), (9.0, 9.0), x0=(3.0, 0.0), x0_max=0.0, **table
-    )
+    problem = Problem("Price-v0", lambda x, u: (0.0 * x[0], u), 5.0, (phase,), (9.0, 9.0), x0_max=0.0, **table)
     flight = fly(new_problem(problem), hold(0.0), np.array([[3.0, 0.0]]))
     assert flight["cost_bounds"][0] == pytest.approx(7 * 0.4 * 2 / 0.5)
     assert flight["reward"].sum() == pytest.approx(-flight["cost"][0])
@@ -390,7 +388,7 @@ def test_the_optimum_knows_the_hidden_parameters(new_problem):
 def test_an_end_out_of_reach_is_one_line(new_problem):
     phase = Phase(5, (100.0, None), 0.1, bonus=1.0, running=lambda x, u: u**2)
     env_id = new_problem(Problem("Far-v0", lambda x, u: (x[1], u), 1.0, (phase,), (200.0, 9.0)))
-    with pytest.raises(NoOptimum, match=r"^start 0, x0 = .* of Far-v0 has no flight within its circles, bounds"):
+    with pytest.raises(NoOptimum, match=r"^start 0, x0 = .* of Far-v0 has no flight that reaches its circles"):
         baselines.reference(env_id, np.zeros((1, 2)))
 
 
@@ -458,6 +456,8 @@ SLIPS = {
     "bonus without radius": (phase(radius=math.inf), "bonus of phase 1"),
     "Q a number": (phase(Q=1.0), "Q of phase 1"),
     "end no function": (phase(end=1.0), "end of phase 1"),
+    "end below 0": (phase(end=lambda x: x[0] - 9.0), "end of phase 1 .* at a start"),
+    "target beyond": (phase(target=(30.0, 0.0)), "target of phase 1 .* within x_max"),
     "running of two": (phase(running=lambda x: 1.0), "running of phase 1"),
     "terminal NaN": (phase(terminal=lambda x: np.nan * x[0]), "a value of terminal of phase 1"),
     "u_max 0": ({"u_max": 0.0}, "u_max"),
@@ -478,7 +478,10 @@ SLIPS = {
     "parameters without scores": ({"parameters": lambda z: (1.0,)}, "scores"),
     "bounds of one": ({"bounds": ((0.0, 1.0),)}, "bounds"),
     "bounds reversed": ({"bounds": ((1.0, 0.0), None)}, "bounds"),
-    "bounds without a price": ({"bounds": ((0.0, 1.0), None)}, "bound_price"),
+    "starts out of bounds": ({"bounds": ((0.0, 1.0), None), "bound_price": 1.0}, "bounds .* must hold the starts"),
+    "one u_max of two": ({"u_names": ("left", "right")}, "u_names .*u_max has 1"),
+    "u of two": ({"f": lambda x, u: (x[1], sum((lambda a, b: (a, b))(*u)))}, "f of Mine-v0 fails"),
+    "bounds without a price": ({"bounds": ((-5.0, 5.0), None)}, "bound_price"),
     "x_scale 0": ({"x_scale": (0.0, 1.0)}, "x_scale"),
     "names of one": ({"x_names": ("angle",)}, "x_names"),
     "velocities beyond": ({"velocities": (2,)}, "velocities"),
