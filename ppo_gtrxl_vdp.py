@@ -144,14 +144,15 @@ OWN = {  # a problem of your own: flights are compared from the first update on,
     "gae_lambda": 1.0,
     "update_epochs": 4,
     "num_minibatches": 4,
-    "learning_rate": 3e-3,
+    "learning_rate": 2e-3,
     "gamma": 1.0,
     "memory_noise": "0:0.1 1:0",
-    "log_std": "0:-0.7 0.3:-1.7 1:-5",
+    "log_std": "0:-0.7 0.2:-1.7 1:-4.5",  # the bound is e^0
     "log_radius": "0:2.5 0.5:0",
+    "weight_average": 0.998,
 }
-OWN_WITH_ONE_START = {**OWN, "total_updates": 500, "num_envs": 64, "flights_per_start": 64}
-OWN_WITH_STARTS = {**OWN, "total_updates": 200, "num_envs": 256, "flights_per_start": 16}
+OWN_WITH_ONE_START = {**OWN, "total_updates": 1400, "num_envs": 64, "flights_per_start": 64}
+OWN_WITH_STARTS = {**OWN, "total_updates": 150, "num_envs": 256, "flights_per_start": 16}
 
 
 def recipe(args):

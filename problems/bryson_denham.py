@@ -12,14 +12,14 @@ BRYSON_DENHAM = envs.Problem(
     u_max=10.0,
     phases=(
         envs.Phase(
-            steps=50,
+            steps=25,
             target=(0.0, -1.0),
             radius=0.01,
             bonus=20.0,
             running=lambda x, u: 0.5 * u**2,
         ),
     ),
-    dt=0.02,
+    dt=0.04,
     x0=(0.0, 1.0),
     x0_max=0.0,  # one start
     bounds=((None, 1 / 9), None),
