@@ -1,5 +1,6 @@
 """Tables of any number of states and controls: against closed forms, SciPy's integrator and published optima."""
 
+import json
 import math
 import re
 import subprocess
@@ -18,6 +19,7 @@ from scipy.stats import norm
 import baselines
 import envs
 import evaluate
+import ppo_gtrxl_vdp as script
 from common.errors import BadInput, NoOptimum
 from common.integration import falling_root
 from common.tasks import task_of
@@ -285,6 +287,21 @@ def test_every_table_of_ours_is_measured_and_drawn(env_id, tmp_path):
     env.reset(seed=0)
     env.step(env.action_space.sample())
     assert env.render().shape == (450, 800, 3)
+
+
+@pytest.mark.parametrize("env_id", OWN)
+def test_every_table_of_ours_trains_and_is_flown_again(env_id, tmp_path, monkeypatch):
+    """By its id alone, in the recipe of its kind; the policy that is written gives the same evaluation."""
+    monkeypatch.chdir(tmp_path)
+    network = ["--num-blocks=1", "--embed-dim=8", "--mlp-dim=8", "--hidden-dim=8", "--num-heads=2"]
+    script.main([*network, f"--env-id={env_id}", "--total-updates=2", "--num-envs=16", "--eval-starts=10"])
+    (run,) = (tmp_path / "runs").iterdir()
+    args, metrics = (json.loads((run / name).read_text()) for name in ("args.json", "eval.json"))
+    assert args["flights_per_start"] == 16 and args["gae_lambda"] == 1 and args["env_id"] == env_id
+    script.main(["--eval-only", f"--checkpoint={run / 'agent.safetensors'}", "--eval-starts=10", "--eval-json=a.json"])
+    again = json.loads((tmp_path / "a.json").read_text())
+    for part in ("cost_mean", "reference_cost_mean", "hit_rate", "episodic_return"):
+        assert again[part] == pytest.approx(metrics[part], rel=1e-6), part
 
 
 def test_a_root_is_found_to_rounding():
