@@ -264,7 +264,7 @@ def test_frames_of_the_batch_are_those_of_single_environments(env_id):
     if env_id in envs.ROCKETS:
         single.reset()
     else:
-        single.reset(options={"x0": obs[1, :2]})
+        single.reset(options={"x0": obs[1, : envs.PROBLEMS[env_id].states]})
     action = action_of(single)
     for _ in range(3):
         batch.step(np.stack([-action if env_id in envs.PROBLEMS else [1.0, 0.0, 0.0], action]))
