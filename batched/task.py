@@ -8,13 +8,14 @@ import numpy as np
 
 from common.batch import make_batch
 from common.errors import BadInput
+from common.tasks import SampledTask
 
 KEPT_FLIGHTS = 100  # in a results folder
 SHOWN_FLIGHTS = 10  # in a figure
 
 
 @dataclass(frozen=True)
-class BatchedTask:
+class BatchedTask(SampledTask):
     """An environment derived from `BatchedEnv`, measured over the episodes that a seed begins."""
 
     env_id: str
@@ -59,19 +60,7 @@ class BatchedTask:
                 metrics.setdefault(key if key.startswith("episodic_") else f"{key}_mean", float(value.mean()))
         return metrics, {"t": envs.dt * np.arange(T + 1), "obs": seen, "u": u, "reward": reward}
 
-    def reported_metrics(self, metrics: dict, timed_policy=None, **env_options) -> dict:
-        return {}
-
     # --- the size of an evaluation, and what a run may not do
-
-    def default_flights(self, is_brief: bool, **env_options) -> int:
-        return 50 if is_brief else 1000
-
-    def interim_flights(self, n: int, **env_options) -> int:
-        return n
-
-    def remark_on_seed(self, eval_seed: int) -> str | None:
-        return f"--eval-seed {eval_seed} is the training's --seed: it may have flown these starts"
 
     def refusal(self, trains: bool, **env_options) -> tuple[str, str] | None:
         try:

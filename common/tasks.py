@@ -129,6 +129,22 @@ class Task(Protocol):
         ...
 
 
+class SampledTask:
+    """What tasks have in common whose flights are sampled anew by every seed, and all cost the same."""
+
+    def reported_metrics(self, metrics: dict, timed_policy: Callable | None = None, **env_options) -> dict:
+        return {}
+
+    def default_flights(self, is_brief: bool, **env_options) -> int:
+        return 50 if is_brief else 1000
+
+    def interim_flights(self, n: int, **env_options) -> int:
+        return n
+
+    def remark_on_seed(self, eval_seed: int) -> str | None:
+        return f"--eval-seed {eval_seed} is the training's --seed: it may have flown these starts"
+
+
 # of each family its tables by environment id, and how to make a task of an id
 FAMILIES: list[tuple[Mapping[str, Any], Callable[[str], Task]]] = []
 

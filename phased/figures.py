@@ -75,7 +75,8 @@ def time_figure(problem: Problem, arrays: dict, title: str) -> Figure:
     mark_table(problem, panels)
     figure.suptitle(title if problem.has_one_flight else f"{title}\nthe first {len(arrays['x'][:SHOWN])} starts")
     handles = [Line2D([], [], **POLICY, label="policy"), Line2D([], [], **OPTIMUM, label="optimum")]
-    handles.append(Line2D([], [], **TARGET, linestyle="--", label="target"))
+    if any(phase.target is not None for phase in problem.phases):
+        handles.append(Line2D([], [], **TARGET, linestyle="--", label="target"))
     handles.append(Line2D([], [], **BOUNDARY, label="bound, or end of a phase"))
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
     return figure

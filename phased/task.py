@@ -9,6 +9,7 @@ import numpy as np
 
 from common.command_line import integer
 from common.errors import BadInput
+from common.tasks import SampledTask
 from phased.environment import fly
 from phased.metrics import flight_metrics, near_origin_metrics, ratio_metrics
 from phased.problem import Problem, flights_of_seed
@@ -18,7 +19,7 @@ KEPT_STARTS = 100  # in a results folder
 
 
 @dataclass(frozen=True)
-class PhasedTask:
+class PhasedTask(SampledTask):
     """A problem in `PROBLEMS`, measured over starts in its box."""
 
     env_id: str
@@ -58,21 +59,12 @@ class PhasedTask:
             arrays["draw"] = draw
         return metrics, arrays
 
-    def reported_metrics(self, metrics: dict, timed_policy=None, **env_options) -> dict:
-        return {}
-
     # --- the size of an evaluation, and what a run may not do
 
     def default_flights(self, is_brief: bool, **env_options) -> int:
         if self.problem.has_one_flight:
             return 10
-        return 50 if is_brief else 1000
-
-    def interim_flights(self, n: int, **env_options) -> int:
-        return n
-
-    def remark_on_seed(self, eval_seed: int) -> str | None:
-        return f"--eval-seed {eval_seed} is the training's --seed: it may have flown these starts"
+        return super().default_flights(is_brief)
 
     def refusal(self, trains: bool, **env_options) -> tuple[str, str] | None:
         return None
