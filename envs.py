@@ -1,19 +1,23 @@
 """The problems: dynamics and tables of the small ones, and every environment id.
 
-Importing this module registers (section "Numerical Simulations" of the paper; the last, with free final time, is ours)
+Importing this module registers the problems of the paper's section "Numerical Simulations",
 
-    DoubleIntegrator-v0  DoubleIntegratorWaypoints-v0  VanDerPol-v0  VanDerPolWaypoints-v0
-    RocketAscent-v0  RocketAscentCutoff-v0
+    DoubleIntegrator-v0  DoubleIntegratorWaypoints-v0  VanDerPol-v0  VanDerPolWaypoints-v0  RocketAscent-v0
+
+what we add, the ascent with free final time and two landings of other papers,
+
+    RocketAscentCutoff-v0  MarsLanding-v0  PoweredDescent-v0
 
 and the problems and rockets in the files of `problems/` and `vehicles/`.
 
 `gymnasium.make(id)` gives one environment, `gymnasium.make_vec(id, num_envs=N)` N of them, stepped together in float64
 NumPy with no Python loop over environments. The small problems' environment is `phased/environment.py`, the rocket's
-`rocket/environment.py`; what all share is `common/batch.py`. What a user of an environment needs is imported here, too.
+`rocket/environment.py`, the lander's `landing/environment.py`; what all share is `common/batch.py`. What a user of an
+environment needs is imported here, too.
 Reading order: dynamics, tables, registration.
 To add a problem of the first kind: a file in `problems/` with its dynamics and its table, which calls
-`register_problem`. To add a rocket: a file in `vehicles/` that calls `register_rocket`. To add a family: a folder, and
-one line `add_family` at the end.
+`register_problem`. To add a rocket or a lander: a file in `vehicles/` that calls `register_rocket` or
+`register_lander`. To add a family: a folder, and one line `add_family` at the end.
 """
 
 from __future__ import annotations
@@ -29,6 +33,16 @@ from common.batch import BatchedEnv, SingleEnv
 from common.errors import BadInput
 from common.integration import rk4
 from common.tasks import add_family
+from landing.environment import (
+    LanderEnv,
+    LanderVectorEnv,
+    fly_lander,
+    make_lander,
+    make_lander_vector,
+    register_lander,
+)
+from landing.lander import LANDERS, MARS, POWERED_DESCENT, Lander
+from landing.task import LanderTask
 from phased.environment import (
     PhasedEnv,
     PhasedVectorEnv,
@@ -63,13 +77,14 @@ from rocket.task import RocketTask
 from rocket.vehicle import ROCKET, Burn, Engine, Rocket, delta_v, launch_raan
 
 __all__ = [  # what users import from here
-    "DISPERSION", "PAPER_MISSION", "PROBLEMS", "ROCKET", "ROCKETS",
-    "BadInput", "BatchedEnv", "Burn", "Dispersion", "Engine", "Mission", "Phase", "PhasedEnv", "PhasedVectorEnv",
-    "Problem", "Rocket", "RocketEnv", "RocketVectorEnv", "SingleEnv",
-    "ascent_dynamics", "delta_v", "draw_bounds", "draw_names", "draw_vehicles", "flown_mission", "fly", "fly_rocket",
-    "launch_raan", "local_frame", "make_phased", "make_phased_vector", "make_rocket", "make_rocket_vector",
-    "orbit_vectors", "orbital_elements", "own_ids", "register_problem", "register_rocket", "rk4", "specific_energy",
-    "target_axes", "target_orbit", "terminal_error", "uniform",
+    "DISPERSION", "LANDERS", "MARS", "PAPER_MISSION", "POWERED_DESCENT", "PROBLEMS", "ROCKET", "ROCKETS",
+    "BadInput", "BatchedEnv", "Burn", "Dispersion", "Engine", "Lander", "LanderEnv", "LanderVectorEnv", "Mission",
+    "Phase", "PhasedEnv", "PhasedVectorEnv", "Problem", "Rocket", "RocketEnv", "RocketVectorEnv", "SingleEnv",
+    "ascent_dynamics", "delta_v", "draw_bounds", "draw_names", "draw_vehicles", "flown_mission", "fly", "fly_lander",
+    "fly_rocket", "launch_raan", "local_frame", "make_lander", "make_lander_vector", "make_phased",
+    "make_phased_vector", "make_rocket", "make_rocket_vector", "orbit_vectors", "orbital_elements", "own_ids",
+    "register_lander", "register_problem", "register_rocket", "rk4", "specific_energy", "target_axes", "target_orbit",
+    "terminal_error", "uniform",
 ]  # fmt: skip
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -165,10 +180,13 @@ def import_files_of(folder: str):
 
 register_rocket("RocketAscent-v0", **vars(PAPER_MISSION))
 register_rocket("RocketAscentCutoff-v0", **vars(replace(PAPER_MISSION, cutoff=True, floor_km=110.0)))
+register_lander("MarsLanding-v0", MARS)
+register_lander("PoweredDescent-v0", POWERED_DESCENT)
 import_files_of("problems")
 import_files_of("vehicles")
 add_family(ROCKETS, RocketTask.of)
-WITHOUT_OPTIMUM = RegisteredIds(PROBLEMS, ROCKETS)
+add_family(LANDERS, LanderTask.of)
+WITHOUT_OPTIMUM = RegisteredIds(PROBLEMS, ROCKETS, LANDERS)
 add_family(WITHOUT_OPTIMUM, BatchedTask)
 
 

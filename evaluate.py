@@ -116,7 +116,7 @@ def keep_excerpt(path, task):
     """Cut an eval.npz to the arrays that a results folder keeps."""
     arrays = read_npz(path)
     kept = task.kept_arrays(arrays)
-    if any(len(kept[key]) < len(arrays[key]) for key in kept):
+    if any(kept[key].shape != arrays[key].shape for key in kept):
         write_npz(path, kept)
 
 

@@ -39,6 +39,7 @@ from common.curves import read_curve
 from common.errors import BadInput, NoOptimum
 from common.evaluations import write_evaluation
 from common.tasks import Task, task_of
+from landing.lander import FAILURE_TIMES
 
 gc.freeze()  # what was imported is never garbage; looking through it took a fifth of the time of --help
 
@@ -72,15 +73,18 @@ RANGES = {  # lowest and highest value of every numeric flag; NaN and infinity a
     **dict.fromkeys(["total_updates", "num_envs", "num_minibatches", "update_epochs"], (1, 10**6)),
     **dict.fromkeys(["embed_dim", "num_heads", "mlp_dim", "hidden_dim"], (1, 8192)),
     **dict.fromkeys(["learning_rate", "clip_coef", "gamma", "gae_lambda", "memory_noise"], (0.0, 1.0)),
-    **dict.fromkeys(["ent_coef", "vf_coef", "mass_weight"], (0.0, 1e3)),
+    **dict.fromkeys(["ent_coef", "vf_coef", "mass_weight", "fuel_weight", "slope_weight"], (0.0, 1e3)),
     **dict.fromkeys(["reward_scale", "max_grad_norm", "target_kl"], (1e-9, 1e9)),
     **{"log_std": (-8.0, 0.5), "log_radius": (-5.0, 14.0)},
     **{"eval_starts": (10, 10**6), "num_blocks": (0, 64), "memory_length": (0, 8192)},
     **{"flights_per_start": (1, 10**6), "dispersion": (0.0, 10.0), "weight_average": (0.0, 0.99999)},
+    **{"failure_probability": (0.0, 1.0), "decision_s": (0.2, 10.0), "longest_flight": (1.0, 1000.0)},
+    **dict.fromkeys(["failure_size", "training_failure_size"], (1.0, 100.0)),
 }
-CHOICES = {"recipe": ("ours", "paper")}
+CHOICES = {"recipe": ("ours", "paper"), "failure_time": FAILURE_TIMES}
 NETWORK = ("num_blocks", "embed_dim", "num_heads", "memory_length", "mlp_dim", "hidden_dim")
 NOT_OF_A_CHECKPOINT = {"dispersion"}  # options of the environment that are chosen anew for every run and evaluation
+MAY_DIFFER_FROM_A_CHECKPOINT = {"failure_probability", "failure_size", "failure_time"}  # else they are the file's
 MAY_CHANGE_ON_RESUME = {"resume", "cuda", "num_threads"}
 
 
@@ -209,7 +213,8 @@ def read_policy(path, kind, env_options, buffers):
 
 def contradictions(args, typed, decided):
     """The fields that were typed and are not as a checkpoint decides them."""
-    return [name for name, value in decided.items() if name in typed and getattr(args, name) != value]
+    fixed = {name: value for name, value in decided.items() if name not in MAY_DIFFER_FROM_A_CHECKPOINT}
+    return [name for name, value in fixed.items() if name in typed and getattr(args, name) != value]
 
 
 def take_checkpoint_args(args, kind, typed, env_options, buffers):
@@ -226,6 +231,7 @@ def take_checkpoint_args(args, kind, typed, env_options, buffers):
             decided[name] = given
         else:
             refuse(name, given, f"the checkpoint has {value}; leave the flag out")
+    decided |= {name: getattr(args, name) for name in MAY_DIFFER_FROM_A_CHECKPOINT & typed}
     for name, value in decided.items():
         setattr(args, name, value)
     saved["keeps_log_std"] = "log_std" not in typed
@@ -235,7 +241,7 @@ def take_checkpoint_args(args, kind, typed, env_options, buffers):
 def check_values(args, env_ids):
     """Refuse a number out of its range, and a word that is not among those of its flag."""
     for name, choices in {"env_id": env_ids, **CHOICES}.items():
-        value = getattr(args, name)
+        value = getattr(args, name, choices[0])
         if value not in choices:
             refuse(name, value, f"must be one of {', '.join(choices)}")
     kinds = get_type_hints(type(args), include_extras=True)

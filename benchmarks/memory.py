@@ -3,6 +3,7 @@
     python benchmarks/run_seeds.py benchmarks/memory_di_jobs.txt --at-once 2 --numbers      # trains what is missing
     python benchmarks/run_seeds.py benchmarks/memory_nominal_jobs.txt --at-once 2           # the same: hours
     python benchmarks/run_seeds.py benchmarks/memory_rocket_jobs.txt --at-once 2 --numbers  # the same: hours
+    python benchmarks/run_seeds.py benchmarks/memory_lander_jobs.txt --at-once 2 --numbers  # the same: hours
     python benchmarks/memory.py                                                             # prints, draws: seconds
     python benchmarks/memory.py --by-seed                                                   # a line for each run
 
@@ -85,6 +86,13 @@ DISPERSED = {
     "dispersed_box_rate": "in the box",
     "dispersed_mass_mean_kg": "mass (kg)",
 }
+LANDED = {
+    "landed_rate": "landed",
+    "position_error_mean_m": "position error, mean (m)",
+    "position_error_p95_m": "p95 (m)",
+    "speed_mean_m_s": "speed, mean (m/s)",
+    "fuel_ratio": "propellant / optimum's",
+}
 EXPERIMENTS = {
     "hidden_velocity": Experiment(
         "Double integrator, velocity hidden: cost over the optimum's, which sees it (ratio of sums)",
@@ -128,6 +136,24 @@ EXPERIMENTS = {
         "Dispersed rocket, cut-off: ||error|| over 1705 flights",
         rocket_rows("rocket_dispersed"),
         DISPERSED,
+    ),
+    "lander": Experiment(
+        "Landing, failure at a random moment, the last command shown: share of the flights that landed",
+        {**lengths(0, 1, 8, 32), "mlp": "MLP of about the same size"},
+        LANDED,
+    ),
+    "lander_conditions": Experiment(
+        "Landing, one condition changed",
+        {
+            "from_start_0": "L_mem 0, failure from the start",
+            "from_start_32": "L_mem 32, failure from the start",
+            "command_hidden_0": "L_mem 0, last command hidden",
+            "command_hidden_32": "L_mem 32, last command hidden",
+            "velocity_hidden_0": "L_mem 0, velocity hidden",
+            "velocity_hidden_32": "L_mem 32, velocity hidden",
+        },
+        LANDED,
+        drawn=False,
     ),
 }
 

@@ -18,12 +18,16 @@ def rk4(f, x, u, dt):
     return tuple(xi + dt / 6 * (a + 2 * (b + c) + d) for xi, a, b, c, d in zip(x, k1, k2, k3, k4))
 
 
-def falling_root(value, begin, end, until, evaluations=10):
-    """The times (n,) in (0, until] at which value(h (n,)) falls through 0: there it is 0 or just below.
+ROOT_TOLERANCE = 1e-12  # of the value at the begin
 
-    begin > 0 >= end: its values at 0 and `until` (n,). Regula falsi with the Pegasus change (Dowell and Jarratt, 1972):
-    where one end of the bracket is replaced twice in a row, the value at the other is made smaller. The number of
-    evaluations is the same for all, so that a row does not depend on the rest of the batch.
+
+def falling_root(value, begin, end, until, evaluations=14):
+    """The times (n,) in (0, until] at which value(h (n,)) falls through 0: there it is 0, to 1e-12 of `begin`.
+
+    begin > 0 >= end: its values at 0 and `until` (n,). A value that is above 0 by rounding alone counts as 0: secants
+    from above may come near the root without ever passing it. Regula falsi with the Pegasus change (Dowell and Jarratt,
+    1972): where one end of the bracket is replaced twice in a row, the value at the other is made smaller. The number
+    of evaluations is the same for all, so that a row does not depend on the rest of the batch.
     """
     low, high = np.zeros_like(begin), until.copy()
     f_low, f_high = begin.copy(), np.minimum(end, -1e-300)
@@ -31,7 +35,7 @@ def falling_root(value, begin, end, until, evaluations=10):
     for _ in range(evaluations):
         h = np.clip(high - f_high * (high - low) / (f_high - f_low), low, high)
         f = value(h)
-        below = f <= 0
+        below = f <= ROOT_TOLERANCE * begin
         with np.errstate(divide="ignore", invalid="ignore"):  # where it is not used
             lighter_low = f_low * f_high / (f_high + f)
             lighter_high = f_high * f_low / (f_low + f)

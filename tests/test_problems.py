@@ -68,7 +68,7 @@ def test_a_fall_ends_at_the_ground(new_problem):
         steps = math.ceil(time / 0.1)
         assert np.isfinite(x[: steps + 1]).all() and np.isnan(x[steps + 1 :]).all()
         assert np.isfinite(u[:steps]).all() and np.isnan(u[steps:]).all()
-        assert x[steps] == pytest.approx([0.0, -G * time], abs=1e-11) and x[steps, 0] <= 0
+        assert x[steps] == pytest.approx([0.0, -G * time], abs=1e-11) and x[steps, 0] <= 1e-12
 
 
 @pytest.mark.parametrize("speed, touches", [(-1.0, True), (-0.9, False)])
@@ -305,12 +305,25 @@ def test_every_table_of_ours_trains_and_is_flown_again(env_id, tmp_path, monkeyp
 
 
 def test_a_root_is_found_to_rounding():
-    """Of functions that are not straight: at 0 or just below."""
+    """Of functions that are not straight: at 0, to 1e-12 of the value at the begin."""
     roots = np.array([0.013, 0.4, 0.999])
     value = lambda h: (roots - h) * (1 + 3 * h + 5 * h**2)  # noqa: E731
     found = falling_root(value, value(np.zeros(3)), value(np.ones(3)), np.ones(3))
     np.testing.assert_allclose(found, roots, rtol=0, atol=1e-12)
-    assert (value(found) <= 0).all()
+    assert (value(found) <= 1e-12 * value(np.zeros(3))).all()
+
+
+def test_a_root_is_found_where_secants_stay_above_it():
+    """Near-straight falls of a lander: 7 in 1000 were not found while a value of 1e-14 counted as above ground."""
+    rng = np.random.default_rng(0)
+    a, b, c = rng.uniform(0.01, 0.9, 20_000), rng.uniform(5.0, 12.0, 20_000), rng.uniform(-0.5, 0.5, 20_000)
+    until = np.full(20_000, 0.2)
+    value = lambda h: a - b * h - c * h * h  # noqa: E731
+    falls = value(until) < 0
+    a, b, c, until = a[falls], b[falls], c[falls], until[falls]
+    found = falling_root(value, value(0 * until), value(until), until)
+    exact = 2 * a / (b + np.sqrt(b * b + 4 * a * c))
+    np.testing.assert_allclose(found, exact, rtol=0, atol=1e-12)
 
 
 # --- the optimum ------------------------------------------------------------------------------------------------------
@@ -530,7 +543,7 @@ def test_an_id_that_is_taken_is_refused():
 
 def test_a_file_that_fails_is_left_out_with_one_line(tmp_path):
     """The others are there: the command of another id still works."""
-    for part in ("batched", "common", "drawing", "phased", "rocket", "vehicles", "problems"):
+    for part in ("batched", "common", "drawing", "landing", "phased", "rocket", "vehicles", "problems"):
         (tmp_path / part).symlink_to(ROOT / part)
     (tmp_path / "problems").unlink()
     (tmp_path / "problems").mkdir()

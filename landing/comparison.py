@@ -1,0 +1,211 @@
+"""A landing policy against its opponents, all on the same draws: one table, opponents.json.
+
+    python evaluate.py opponents results/mars_landing
+
+`guidance.py` has the opponents; here they are flown, measured as a policy is, and printed, beside the rows that the
+published code's notebooks print. Policies are flown by their script in processes of its own: nothing imports a script,
+or torch.
+Reading order: policies, laws, table, command.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from common.checkpoints import read_checkpoint
+from common.errors import BadInput, refuse_unless
+from common.files import write_json
+from landing.environment import fly_lander
+from landing.guidance import LAWS, Replanned, drdv, drdv_estimated
+from landing.lander import LANDERS, Lander, flights
+from landing.metrics import draws, flight_metrics, fly_draws
+from landing.optimum import references
+
+POLICY_SCRIPT = Path(__file__).parents[1] / "ppo_gtrxl_lander.py"
+FAILURE = ("failure_probability", "failure_size", "failure_time")
+SOLVING = {"replanned", "replanned_wary"}  # laws that fly the first draws alone
+TIMED_FLIGHTS = 100  # flights at once when a decision is timed
+
+# rows that the published notebooks print (RL-Meta-Learning-ACTA, Experiments/Mars3DOF/Engine_failure, cells of
+# `test_policy_batch`): position error mean and max (m), speed mean, sigma and max (m/s), fuel (kg), number of flights
+PUBLISHED = {
+    "DR/DV, no failure": (0.0, 0.1, 0.52, 0.24, 1.0, 255.2, 1000),
+    "DR/DV": (144.9, 1322.8, 19.5, 19.9, 63.1, 214.4, 1000),
+    "MLP": (0.7, 2.2, 1.00, 0.62, 4.8, 301.8, 10000),
+    "GRU, 60 steps": (0.3, 1.3, 1.00, 0.06, 1.2, 294.9, 10000),
+}
+PUBLISHED_KEYS = ("position_error_mean_m", "position_error_max_m", "speed_mean_m_s", "speed_std_m_s", "speed_max_m_s")
+PUBLISHED_KEYS += ("fuel_mean_kg", "eval_starts")
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Policies
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def fly_checkpoint(path, failure: dict, eval_seed: int, n: int) -> dict:
+    """What the policy's script finds on the first n draws of a seed. BadInput with the script's own line."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "eval.json"
+        flags = {"checkpoint": path, "eval-starts": n, "eval-seed": eval_seed, "eval-json": file, "num-threads": 1}
+        flags |= {name.replace("_", "-"): value for name, value in failure.items()}
+        command = [sys.executable, str(POLICY_SCRIPT), "--eval-only", "--no-cuda"]
+        command += [f"--{name}={value}" for name, value in flags.items()]
+        done = subprocess.run(command, capture_output=True, text=True)
+        if done.returncode:
+            said = done.stderr.strip().splitlines() or [f"{POLICY_SCRIPT.name} ended with {done.returncode}"]
+            raise BadInput(f"{path}: {said[-1]}")
+        metrics = json.loads(file.read_text())
+    kept = {key: value for key, value in metrics.items() if isinstance(value, int | float)}
+    return kept | {"knows": "flights in training"}
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Laws
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def fly_law(env_id: str, make_law: Callable, z: np.ndarray, fuel: np.ndarray, **options) -> dict:
+    """The metrics of a law on draws z (n, 13); `fuel` (k,) is the optimum's of the first k, NaN where it has none."""
+    flown = fly_draws(env_id, make_law, z, **options)
+    known = np.flatnonzero(np.isfinite(fuel[: len(z)]))
+    ratio = float(flown["fuel_kg"][known].mean() / fuel[known].mean())
+    return {"eval_starts": len(z)} | flight_metrics(flown) | {"fuel_ratio": ratio, "reference_starts": len(known)}
+
+
+def decision_us(env_id: str, make_law: Callable, z: np.ndarray, **options) -> float:
+    """Microseconds of a law's decision for one flight, of many at once."""
+    spent, calls = 0.0, 0
+    law = make_law(z)
+
+    def timed(obs, t):
+        nonlocal spent, calls
+        began = time.perf_counter()
+        action = law(obs, t)
+        spent, calls = spent + time.perf_counter() - began, calls + len(obs)
+        return action
+
+    fly_lander(env_id, timed, z, **options)
+    return 1e6 * spent / calls
+
+
+def law_makers(lander: Lander, failure: dict) -> dict[str, Callable]:
+    """By the names of `LAWS`: make_law(z) gives the law for flights of draws z (n, 13)."""
+    return {
+        "drdv": lambda z: drdv(lander, flights(lander, z, *failure.values()).gravity.T),
+        "drdv_estimated": lambda z: drdv_estimated(lander),
+        "replanned": lambda z: Replanned(lander),
+        "replanned_wary": lambda z: Replanned(lander, is_wary=True),
+    }
+
+
+def fly_laws(env_id: str, failure: dict, eval_seed: int, n: int, solved: int) -> dict:
+    """Every law's metrics, by name, then the optimum's."""
+    z = draws(eval_seed, n)
+    optimum = references(env_id, z[:solved], **failure)
+    rows = {}
+    for name, make_law in law_makers(LANDERS[env_id], failure).items():
+        flown = z[:solved] if name in SOLVING else z
+        rows[name] = fly_law(env_id, make_law, flown, optimum["fuel_kg"], **failure)
+        timed = z[: 4 if name in SOLVING else TIMED_FLIGHTS]
+        rows[name] |= {"knows": LAWS[name], "decision_us": decision_us(env_id, make_law, timed, **failure)}
+    return rows | {"optimum": optimum_row(optimum)}
+
+
+def optimum_row(optimum: dict) -> dict:
+    """The optimum's own row."""
+    fuel = optimum["fuel_kg"][optimum["solved"]]
+    row = {"eval_starts": len(fuel), "fuel_mean_kg": float(fuel.mean()), "fuel_ratio": 1.0}
+    return row | {"reference_starts": len(fuel), "knows": "mass, gravity and failure"}
+
+
+def published_rows(env_id: str, eval_seed: int, n: int) -> dict:
+    """The published law by the exact end and by the published one, without and with failures."""
+    lander, z = LANDERS[env_id], draws(eval_seed, n)
+    rows = {}
+    for probability in (0.0, lander.failure_probability):
+        failure = {"failure_probability": probability, "failure_size": lander.failure_size, "failure_time": "start"}
+        make_law = law_makers(lander, failure)["drdv"]
+        for published_end in (False, True):
+            flown = fly_draws(env_id, make_law, z, published_end=published_end, **failure)
+            end = "published" if published_end else "exact"
+            rows[f"drdv, p = {probability:g}, {end} end"] = {"eval_starts": n} | flight_metrics(flown)
+    return rows
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Table
+# ---------------------------------------------------------------------------------------------------------------------
+
+COLUMNS = (  # heading, keys of a row, number format, width
+    ("flights", ("eval_starts",), "d", 7),
+    ("landed", ("landed_rate",), ".2%", 8),
+    ("soft", ("soft_rate",), ".2%", 8),
+    ("position mean, max (m)", ("position_error_mean_m", "position_error_max_m"), ".2f", 22),
+    ("speed mean, max (m/s)", ("speed_mean_m_s", "speed_max_m_s"), ".2f", 21),
+    ("fuel (kg)", ("fuel_mean_kg",), ".1f", 9),
+    ("/ optimum", ("fuel_ratio",), ".3f", 9),
+    ("a decision (us)", ("decision_us",), ".0f", 15),
+)
+
+
+def table(report: dict) -> str:
+    """opponents.json as a table: a line a competitor, then the published rows."""
+    width = max(len(name) for part in ("laws", "published_law", "published") for name in report[part])
+    lines = [f"{report['env_id']}, the draws of eval seed {report['eval_seed']}, the same for all"]
+    lines.append(" " * (width + 2) + "".join(f"  {heading:>{w}}" for heading, _, _, w in COLUMNS) + "  knows")
+    for part in ("laws", "published_law", "published"):
+        for name, row in report[part].items():
+            lines.append(f"  {name:<{width}}" + "".join(f"  {cell(row, *column):>{column[3]}}" for column in COLUMNS))
+            lines[-1] += f"  {row.get('knows', '')}".rstrip()
+        lines.append("")
+    lines.append("  landed: within 5 m and 2 m/s, the last 2 m steeper than 5 : 1; soft: whatever the slope")
+    lines.append(f"  / optimum: on the draws of the first {report['solved']} that IPOPT solves, knowing all")
+    return "\n".join(lines)
+
+
+def cell(row: dict, heading: str, keys: tuple, digits: str, width: int) -> str:
+    """A row's numbers of one column; "-" where it has none."""
+    if not all(key in row for key in keys):
+        return "-"
+    return ", ".join(f"{row[key]:{digits}}" for key in keys)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Command
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def compare(env_id: str, folder: Path, dispersion: float, n: int, solved: int, eval_seed: int, also=()):
+    """Compare a results folder's policy, and those of `also` (name, path), with all laws; print, write opponents.json.
+
+    All meet the failures of the folder's eval.json. `dispersion` is a rocket's.
+    """
+    refuse_unless(dispersion == 1.0, "--dispersion", dispersion, f"is no flag of {env_id}; leave it out")
+    refuse_unless(solved <= n, "--solved", solved, f"must be at most --starts, {n}")
+    refuse_unless(os.access(folder, os.W_OK), "the folder", folder, "must be writable")
+    checkpoints = {"policy": folder / "agent.safetensors"}
+    for name, path in also:
+        refuse_unless(name not in {*checkpoints, *LAWS}, "the NAME of --also", name, "must be that of no other row")
+        checkpoints[name] = path
+    for path in checkpoints.values():
+        other = read_checkpoint(path, {}, flag="")["args"]["env_id"]
+        refuse_unless(other == env_id, f"the env_id of {path}", other, f"must be {env_id}, as that of {folder}")
+    metrics = json.loads((folder / "eval.json").read_text())
+    failure = {name: metrics[name] for name in FAILURE}
+    rows = {name: fly_checkpoint(path, failure, eval_seed, n) for name, path in checkpoints.items()}
+    rows |= fly_laws(env_id, failure, eval_seed, n, solved)
+    published = {name: dict(zip(PUBLISHED_KEYS, values)) for name, values in PUBLISHED.items()}
+    report = {"env_id": env_id, "eval_seed": eval_seed, "solved": solved} | failure
+    report |= {"laws": rows, "published_law": published_rows(env_id, eval_seed, n), "published": published}
+    write_json(folder / "opponents.json", report)
+    print(table(report))

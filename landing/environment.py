@@ -1,0 +1,387 @@
+"""The landers' environment: N descents in closed form, exact touchdowns; and how an id is registered."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.envs.registration import ENV_ID_RE
+from gymnasium.spaces import Box
+from gymnasium.vector import AutoresetMode
+
+from common.batch import RENDERED, BatchedEnv, SingleEnv, check_options, of_batch, refuse_autoreset
+from common.errors import BadInput, is_finite, refuse_unless
+from landing.dynamics import Arc
+from landing.lander import DRAW, LANDERS, Flights, Lander, check_failure, flights
+from landing.rewards import (
+    ALOFT_PRICE,
+    FUEL_PRICE,
+    POSITION_SCALE,
+    SLOPE_HEIGHT,
+    SLOPE_PRICE,
+    SPEED_SCALE,
+    has_landed,
+    slope_reward,
+    terminal_reward,
+)
+
+PERIOD = 0.2  # s: a command is held for it, or for a multiple; a failure strikes at one of its multiples
+PUBLISHED_CHECKS = (0.05, 0.1, 0.15, 0.2)  # s, when the published code looks at the altitude
+PUBLISHED_GROWTH = 500.0  # m by which the range may grow past its least
+
+
+class LanderVectorEnv(BatchedEnv):
+    """N descents of a `Lander`.
+
+    Action: the thrust vector over `greatest_thrust`. Its norm is clipped to the engine's limits; a zero command gets
+    the least thrust straight up. It is held for `decision_s` seconds (0.2, or a multiple). A failure then multiplies
+    each axis by its effectiveness, and the norm is clipped once more.
+
+    Observation: r (m), v (m/s), time (s), and the clipped command of the step before in units of the action (0 at
+    first). Mass, gravity and failure are hidden. `observe_draw` shows them: mass over its nominal value, gravity's
+    deviation over its nominal value (3), the effectiveness of each axis at this moment (3). `observe_velocity=False`,
+    `observe_phase=False` (the time) and `observe_command=False` show zeros.
+
+    A flight ends at the exact moment of touchdown, or after `longest_flight` seconds (the lander's). With
+    `published_end` it ends as in the published code, which looks at the altitude every 0.05 s, flies on for one step
+    after the longest time, and stops a flight whose range grows by 500 m past its least.
+
+    Reward: -`fuel_price` for 100 kg burnt in the step; at the end `terminal_reward`, and `slope_reward` or, in the air,
+    -`aloft_price`. The prices and scales are attributes that only training changes. So is `sink_rate` (m/s), the
+    vertical speed at touchdown that counts as none.
+
+    `final_info`: `episodic_return` (with the prices and scales of `rewards.py`), `position_error` (m), `speed` (m/s),
+    `slope`, `down`, `landed`, `fuel_kg`, `final_time` (s), each (N,), `final_y` (N, 7) and `draw` (N, 13).
+
+    `reset(options={"draw": (N, 13)})` sets what is drawn, numbers from 0 to 1 (`lander.DRAW`); `{"x0": (N, 6)}` sets r
+    and v.
+    """
+
+    metadata = {**BatchedEnv.metadata, **RENDERED}
+
+    def __init__(
+        self,
+        lander: Lander,
+        num_envs: int = 1,
+        failure_probability: float | None = None,
+        failure_size: float | None = None,
+        failure_time: str = "start",
+        observe_command: bool = True,
+        observe_draw: bool = False,
+        observe_velocity: bool = True,
+        observe_phase: bool = True,
+        decision_s: float = PERIOD,
+        longest_flight: float | None = None,
+        published_end: bool = False,
+        render_mode: str | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
+    ):
+        self.lander = lander
+        self.failure_probability = lander.failure_probability if failure_probability is None else failure_probability
+        self.failure_size = lander.failure_size if failure_size is None else failure_size
+        self.failure_time = failure_time
+        check_failure(self.failure_probability, self.failure_size, failure_time)
+        self.observe_command, self.observe_draw = observe_command, observe_draw
+        self.observe_velocity, self.observe_phase = observe_velocity, observe_phase
+        self.published_end = published_end
+        multiple = is_finite(decision_s) and decision_s > 0 and abs(decision_s / PERIOD % 1 - 0.5) > 0.5 - 1e-6
+        refuse_unless(multiple, "decision_s", repr(decision_s), f"must be a multiple of {PERIOD} s")
+        self._hold = round(decision_s / PERIOD)
+        self.longest_flight = lander.longest if longest_flight is None else longest_flight
+        possible = is_finite(self.longest_flight) and 0 < self.longest_flight <= lander.longest
+        allowed = f"must be above 0 and at most the lander's, {lander.longest:g} s"
+        refuse_unless(possible, "longest_flight", repr(longest_flight), allowed)
+        steps = math.ceil(self.longest_flight / self.dt - 1e-9) + published_end
+        action = Box(-1.0, 1.0, (3,), dtype=np.float64)
+        super().__init__(num_envs, steps, self._observation_space(), action, render_mode, autoreset_mode)
+        self.observation_scale = np.array([1000.0] * 3 + [50.0] * 3 + [self.longest_flight] + [1.0] * 3)
+        if observe_draw:
+            self.observation_scale = np.append(self.observation_scale, np.ones(7))
+        self.position_scale, self.speed_scale, self.sink_rate = POSITION_SCALE, SPEED_SCALE, 0.0
+        self.fuel_price, self.aloft_price, self.slope_price = FUEL_PRICE, ALOFT_PRICE, SLOPE_PRICE
+        self.draw = np.zeros((num_envs, len(DRAW)))
+        self.flights = self._drawn(self.draw)
+        self.r, self.v, self.mass = self.flights.r.copy(), self.flights.v.copy(), self.flights.mass.copy()
+        self.u = np.zeros((num_envs, 3))  # N, the clipped command of the step before
+        self.down = np.zeros(num_envs, dtype=bool)
+        self._ended = np.zeros(num_envs, dtype=bool)
+        self._ticks = np.zeros(num_envs, dtype=np.int64)  # periods flown
+        self.time = np.zeros(num_envs)  # s
+        self._above = self.r.copy()  # the last position that was more than `SLOPE_HEIGHT` up
+        self._nearest = np.full(num_envs, np.inf)  # m, the least range
+
+    @property
+    def dt(self) -> float:
+        """Seconds between two decisions."""
+        return self._hold * PERIOD
+
+    def _drawn(self, draw) -> Flights:
+        return flights(self.lander, draw, self.failure_probability, self.failure_size, self.failure_time)
+
+    def _observation_space(self):
+        """The box that holds every observation."""
+        lander = self.lander
+        r, v = lander.reach
+        high = [r] * 3 + [v] * 3 + [lander.longest + PERIOD] + [1.0] * 3
+        low = [-r] * 3 + [-v] * 3 + [0.0] + [-1.0] * 3
+        if self.observe_draw:
+            spread = max(lander.gravity_spread, 1e-3)  # a box must have a width
+            high += [1 + max(lander.mass_spread, 1e-3)] + [spread + 1e-9] * 3 + [1.0] * 3
+            low += [0.0] + [-spread - 1e-9] * 3 + [0.0] * 3
+        return Box(np.array(low), np.array(high), dtype=np.float64)
+
+    def _start(self, mask, options):
+        if options.keys() - {"x0", "draw"}:
+            raise BadInput(f"reset options are {options!r}; they may be 'x0' and 'draw'")
+        count = int(mask.sum())
+        draw = self._draw_starts(lambda n: self.np_random.random((n, len(DRAW))), count)
+        if "draw" in options:
+            draw = self._checked("draw", options["draw"], len(DRAW), "from 0 to 1", lambda z: (z >= 0) & (z <= 1))[mask]
+        new = self._drawn(draw)
+        if "x0" in options:
+            above_ground = lambda x: (x[:, 2:3] > 0) & (x == x)  # noqa: E731
+            x0 = self._checked("x0", options["x0"], 6, "finite, and above the ground (z > 0)", above_ground)[mask]
+            new = new._replace(r=x0[:, :3].T, v=x0[:, 3:].T)
+        for mine, theirs in zip(self.flights, new):
+            mine[..., mask] = theirs
+        self.draw[mask] = draw
+        self.r[:, mask], self.v[:, mask], self.mass[mask] = new.r, new.v, new.mass
+        self._above[:, mask] = new.r
+        self._nearest[mask] = np.inf
+        self.u[mask] = 0.0
+        self.time[mask] = self._ticks[mask] = 0
+        self.down[mask] = self._ended[mask] = False
+
+    def _checked(self, name, given, width, allowed, holds):
+        """An option of `reset` as an array (N, width); BadInput where it is none."""
+        try:
+            rows = np.asarray(given, dtype=np.float64)
+        except (TypeError, ValueError):
+            rows = np.empty(0)
+        if rows.shape != (self.num_envs, width) or not (np.isfinite(rows) & holds(rows)).all():
+            raise BadInput(f"options[{name!r}] must be {allowed}, of shape ({self.num_envs}, {width}); got {given!r}")
+        return rows
+
+    def effectiveness(self) -> np.ndarray:
+        """What the thrust along each axis is multiplied by in this period, (3, N)."""
+        has_struck = self._ticks * PERIOD >= self.flights.strike
+        return np.where(has_struck, self.flights.failed, 1.0)
+
+    def _observe(self):
+        obs = np.empty((self.num_envs, self.single_observation_space.shape[0]))
+        obs[:, 0:3] = self.r.T
+        obs[:, 3:6] = self.v.T if self.observe_velocity else 0.0
+        obs[:, 6] = self.time * self.observe_phase
+        obs[:, 7:10] = self.u / self.lander.greatest_thrust if self.observe_command else 0.0
+        if self.observe_draw:
+            obs[:, 10] = self.mass / self.lander.mass
+            obs[:, 11:14] = self.flights.gravity.T / self.lander.gravity + [0.0, 0.0, 1.0]
+            obs[:, 14:17] = self.effectiveness().T
+        return obs
+
+    def _advance(self, actions):
+        burnt = self.mass.copy()
+        greatest = self.lander.greatest_thrust
+        command = greatest * limited(actions.T, self.lander.least_thrust / greatest, 1.0)
+        self.u[:] = command.T
+        for _ in range(self._hold):
+            self._fly(command)
+        self.t += 1
+        rewards = -self.fuel_price / 100 * (burnt - self.mass)
+        if self._ended.any():
+            end = np.where(self.down, slope_reward(self.slope(), self.slope_price), -self.aloft_price)
+            speed_error = np.sqrt(self.v[0] ** 2 + self.v[1] ** 2 + (self.v[2] + self.sink_rate) ** 2)
+            end += terminal_reward(self.position_error(), speed_error, self.position_scale, self.speed_scale)
+            rewards = rewards + np.where(self._ended, end, 0.0)
+        return rewards, self._ended.copy(), self._final_info
+
+    def _fly(self, command):
+        """Fly one period, in those environments whose flight has not ended."""
+        lander = self.lander
+        thrust = limited(command * self.effectiveness(), lander.least_thrust, lander.greatest_thrust)
+        norm = np.sqrt((thrust * thrust).sum(axis=0))
+        arc = Arc(self.r, self.v, self.mass, thrust / norm, norm / lander.exhaust, self.flights.gravity)
+        length = PERIOD
+        r, v, mass = arc.after(PERIOD, lander)
+        if self.published_end:
+            touches, when = published_touchdown(arc, lander)
+        elif (r[2] < np.maximum(v[2], 0.0) * PERIOD).any():  # below ground, or it may have been
+            touches, when = arc.touchdown(PERIOD, (r, v), lander)
+        else:
+            touches = np.zeros(self.num_envs, dtype=bool)
+        if touches.any():
+            length = np.where(touches, when, PERIOD)
+            r, v, mass = arc.after(length, lander)
+        if self._ended.any():
+            flies = ~self._ended
+            r, v, mass = (np.where(flies, new, old) for new, old in zip((r, v, mass), (self.r, self.v, self.mass)))
+            touches &= flies
+            length = length * flies
+            self._ticks += flies
+        else:
+            self._ticks += 1
+        self.r, self.v, self.mass = r, v, mass
+        self.time = self.time + length
+        is_high = r[2] > SLOPE_HEIGHT
+        self._above = np.where(is_high, r, self._above)
+        self.down = self.down | touches
+        self._ended = self._ended | touches | self._is_over()
+
+    def _is_over(self):
+        """The flights (N,) that end without a touchdown."""
+        elapsed = self._ticks * PERIOD
+        if not self.published_end:
+            return elapsed >= self.longest_flight - 1e-9
+        distance = self.position_error()
+        grows = distance - self._nearest > PUBLISHED_GROWTH
+        self._nearest = np.minimum(self._nearest, distance)
+        return grows | (elapsed > self.longest_flight + 1e-9)
+
+    def position_error(self) -> np.ndarray:
+        """Distance to the pad, (N,) m."""
+        return np.sqrt((self.r * self.r).sum(axis=0))
+
+    def speed(self) -> np.ndarray:
+        """(N,) m/s."""
+        return np.sqrt((self.v * self.v).sum(axis=0))
+
+    def slope(self) -> np.ndarray:
+        """Fall over run from the last sampled position that was more than 2 m up, (N,); the published glide slope."""
+        dx, dy, dz = self._above - self.r
+        return dz / np.maximum(np.hypot(dx, dy), 1e-9)
+
+    def _final_info(self):
+        position_error, speed, slope = self.position_error(), self.speed(), self.slope()
+        fuel = self.flights.mass - self.mass
+        end = np.where(self.down, slope_reward(slope, SLOPE_PRICE), -ALOFT_PRICE)
+        points = terminal_reward(position_error, speed, POSITION_SCALE, SPEED_SCALE)
+        return {
+            "episodic_return": points + end - FUEL_PRICE / 100 * fuel,
+            "position_error": position_error,
+            "speed": speed,
+            "slope": slope,
+            "down": self.down.copy(),
+            "landed": has_landed(position_error, speed, slope, self.down),
+            "fuel_kg": fuel,
+            "final_time": self.time.copy(),
+            "final_y": state_of(self),
+            "draw": self.draw.copy(),
+        }
+
+    def _snapshot(self):
+        return self.time.copy(), self.u.copy(), state_of(self)
+
+    def _make_sheet(self):
+        # Matplotlib takes a quarter of a second that only a picture should cost
+        from landing.animation import DescentSheet
+
+        return DescentSheet(self.lander, "Descent")
+
+
+def limited(vectors, least: float, greatest: float):
+    """Vectors (3, n) whose norms are clipped to these limits; a zero vector points up.
+
+    Each is divided by its largest component first, so that no square overflows.
+    """
+    size = np.abs(vectors).max(axis=0)
+    if size.all():
+        direction = vectors / size
+    else:
+        upward = np.array([[0.0], [0.0], [1.0]])
+        direction = np.where(size == 0, upward, vectors / np.where(size == 0, 1.0, size))
+    length = np.sqrt((direction * direction).sum(axis=0))
+    return direction * (np.minimum(np.maximum(size * length, least), greatest) / length)
+
+
+def published_touchdown(arc: Arc, lander: Lander):
+    """Which flights are below ground when the published code looks, and when that is: a mask (n,) and times (n,)."""
+    touches, when = np.zeros(len(arc.mass), dtype=bool), np.full(len(arc.mass), PERIOD)
+    for h in PUBLISHED_CHECKS:
+        is_below = arc.after(h, lander)[0][2] < 0
+        when[is_below & ~touches] = h
+        touches |= is_below
+    return touches, when
+
+
+class LanderEnv(SingleEnv):
+    """One `LanderVectorEnv`; its public attributes are the batch's."""
+
+    position_scale = of_batch("position_scale", "Scale (m) of the position error in the terminal reward.")
+    speed_scale = of_batch("speed_scale", "Scale (m/s) of the speed in the terminal reward.")
+    sink_rate = of_batch("sink_rate", "Vertical speed (m/s) at touchdown that the reward counts as none.")
+    fuel_price = of_batch("fuel_price", "Reward lost for 100 kg of propellant.")
+    aloft_price = of_batch("aloft_price", "Reward lost where a flight ends in the air.")
+    slope_price = of_batch("slope_price", "Weight of `slope_reward`.")
+
+
+def make_lander_vector(env_id: str, num_envs: int = 1, **options) -> LanderVectorEnv:
+    """The batched environment of a lander in `LANDERS`; what `gymnasium.make_vec` calls."""
+    check_options(LanderVectorEnv, options)
+    return LanderVectorEnv(LANDERS[env_id], num_envs, **options).sealed()
+
+
+def make_lander(env_id: str, **options) -> LanderEnv:
+    """The single environment of a lander in `LANDERS`; what `gymnasium.make` calls."""
+    refuse_autoreset(options)
+    return LanderEnv(make_lander_vector(env_id, **options)).sealed()
+
+
+make_lander.metadata = RENDERED  # where gym.make looks before there is an environment
+
+
+def register_lander(env_id: str, lander: Lander):
+    """Make a lander an environment id that references, evaluation, figures and `ppo_gtrxl_lander.py` take, too.
+
+    Raises BadInput where the id is taken or not one of Gymnasium's.
+    """
+    taken = env_id in gym.registry or not ENV_ID_RE.fullmatch(env_id) or "/" in env_id
+    refuse_unless(not taken, "env_id", repr(env_id), "must be a new id such as MyLander-v0")
+    gym.register(
+        id=env_id,
+        entry_point="envs:make_lander",
+        vector_entry_point="envs:make_lander_vector",
+        kwargs={"env_id": env_id},
+    )
+    LANDERS[env_id] = lander
+
+
+def fly_lander(env_id: str, policy: Callable, draw: np.ndarray, decision_s: float = PERIOD, **options) -> dict:
+    """Fly `policy(obs (n, obs), t) -> action (n, 3)` on draws (n, 13), and record what happened by periods of 0.2 s.
+
+    t counts decisions, one every `decision_s`; a command is repeated until the next.
+
+    Returns u (n, T, 3) N, the command before the failure acts, effectiveness (n, T, 3), and y (n, T+1, 7), r, v and m
+    at the periods' ends, all NaN behind a flight's last period; start (n, 7), gravity (n, 3), and the arrays of
+    `final_info`.
+    """
+    hold = round(decision_s / PERIOD)
+    batch: Any = gym.make_vec(env_id, num_envs=len(draw), **options)  # a LanderVectorEnv
+    obs, _ = batch.reset(options={"draw": draw})
+    start = state_of(batch)
+    gravity = batch.flights.gravity.T.copy()
+    u, effectiveness, y = [], [], [start]
+    final_info, alive = {}, np.ones(len(draw), dtype=bool)
+    for period in range(batch.episode_steps):
+        if period % hold == 0:
+            action = policy(obs, period // hold)
+        acts = batch.effectiveness().T
+        obs, _, ended, final = batch.advance(action)
+        u.append(np.where(alive[:, None], batch.u, np.nan))
+        effectiveness.append(np.where(alive[:, None], acts, np.nan))
+        y.append(np.where(alive[:, None], state_of(batch), np.nan))
+        for key, value in final.items():
+            final_info.setdefault(key, value.copy())[alive & ended] = value[alive & ended]
+        alive &= ~ended
+        if not alive.any():
+            break
+    flown = {"u": u, "effectiveness": effectiveness, "y": y}
+    flown = {key: np.stack(rows, axis=1) for key, rows in flown.items()}
+    return {**flown, "start": start, "gravity": gravity, **final_info}
+
+
+def state_of(batch: LanderVectorEnv) -> np.ndarray:
+    """r, v and m of all flights, (N, 7)."""
+    return np.vstack([batch.r, batch.v, batch.mass]).T

@@ -1,0 +1,162 @@
+"""Landers: the table of a vehicle and its descent, what is drawn for each flight, and what cannot fly.
+
+`MARS` is the problem of Gaudet, Linares and Furfaro, "Adaptive guidance and integrated navigation with reinforcement
+meta-learning" (Acta Astronautica, 2020), with the numbers of their public code. `POWERED_DESCENT` is the lander of
+Acikmese and Ploen, "Convex programming approach to powered descent guidance for Mars landing" (JGCD, 2007).
+
+Axes: x downrange, y crossrange, z up; the pad is the origin.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from common.errors import is_finite, refuse_unless, refuse_unless_finite
+
+FAILURE_TIMES = ("start", "random")
+LAST_FAILURE = 40.0  # s: "random" failures strike before
+VERTICAL_LOSS = 1.5  # a failure divides the thrust along z by this, whatever its size
+
+
+@dataclass(frozen=True)
+class Lander:
+    """One column of numbers: vehicle, planet, and the box of its starts."""
+
+    mass: float  # kg, at first
+    dry_mass: float  # kg; at this mass the engine stops
+    isp: float  # s
+    least_thrust: float  # N
+    greatest_thrust: float  # N
+    start: tuple[float, ...]  # centre of the box of r (m) and v (m/s), six numbers
+    spread: tuple[float, ...] = (0.0,) * 6  # half its widths
+    g0: float = 9.81  # m/s^2, with isp the exhaust velocity
+    cant: float = 0.0  # degrees between the nozzles and the thrust: of their flow, the cosine pushes
+    gravity: float = 3.7114  # m/s^2, downwards
+    mass_spread: float = 0.0  # greatest share by which a flight's mass is off
+    gravity_spread: float = 0.0  # the same of gravity, in each axis
+    failure_probability: float = 0.0  # of a hidden failure, unless the environment is given another
+    failure_size: float = 2.5  # what a failure divides the thrust along one lateral axis by
+    longest: float = 100.0  # s, of a flight
+
+    def __post_init__(self):
+        refuse_unless_finite("a lander's", self)
+        for name in ("mass", "dry_mass", "isp", "least_thrust", "g0", "gravity", "longest"):
+            refuse_unless(getattr(self, name) > 0, f"a lander's {name}", getattr(self, name), "must be positive")
+        for name in ("mass_spread", "gravity_spread"):
+            refuse_unless(0 <= getattr(self, name) < 1, f"a lander's {name}", getattr(self, name), "must be in [0, 1)")
+        allowed = f"must be below its mass, {self.mass} kg, with its spread"
+        refuse_unless(self.dry_mass < self.mass * (1 - self.mass_spread), "a lander's dry_mass", self.dry_mass, allowed)
+        allowed = f"must be at least its least_thrust, {self.least_thrust} N"
+        possible = self.greatest_thrust >= self.least_thrust
+        refuse_unless(possible, "a lander's greatest_thrust", self.greatest_thrust, allowed)
+        refuse_unless(0 <= self.cant < 90, "a lander's cant", self.cant, "must be from 0 to below 90 degrees")
+        check_failure(self.failure_probability, self.failure_size)
+        for name in ("start", "spread"):
+            values = getattr(self, name)
+            six = isinstance(values, tuple | list) and len(values) == 6 and all(map(is_finite, values))
+            refuse_unless(six, f"a lander's {name}", values, "must be six finite numbers: r in m, v in m/s")
+            object.__setattr__(self, name, tuple(map(float, values)))
+        refuse_unless(min(self.spread) >= 0, "a lander's spread", self.spread, "must not be negative")
+        low = self.start[2] - self.spread[2]
+        refuse_unless(low > 0, "a lander's start", self.start, "must be above the ground (z > 0), with its spread")
+
+    @property
+    def exhaust(self) -> float:
+        """Thrust in N for each kg/s of propellant."""
+        return self.isp * self.g0 * math.cos(math.radians(self.cant))
+
+    @property
+    def reach(self) -> tuple[float, float]:
+        """Bounds of |r| (m) and |v| (m/s): thrust and gravity pointing one way for the longest flight."""
+        r0, v0 = self.farthest(slice(0, 3)), self.farthest(slice(3, 6))
+        gravity = self.gravity * (1 + 2 * self.gravity_spread)  # three components, each off by the spread
+        gain = self.exhaust * math.log(self.mass * (1 + self.mass_spread) / self.dry_mass)
+        v = v0 + gain + gravity * self.longest
+        return r0 + v * self.longest, v
+
+    @property
+    def has_one_flight(self) -> bool:
+        """Whether all flights are alike, as long as nothing fails."""
+        return not any((*self.spread, self.mass_spread, self.gravity_spread, self.failure_probability))
+
+    def farthest(self, of: slice) -> float:
+        """The greatest norm of some components of a start."""
+        return float(np.linalg.norm(np.abs(self.start[of]) + np.array(self.spread[of])))
+
+
+def check_failure(probability: float, size: float, time: str = "start"):
+    """BadInput for a failure that cannot be drawn."""
+    in_unit = is_finite(probability) and 0 <= probability <= 1
+    refuse_unless(in_unit, "failure_probability", repr(probability), "must be from 0 to 1")
+    refuse_unless(is_finite(size) and size >= 1, "failure_size", repr(size), "must be at least 1")
+    refuse_unless(time in FAILURE_TIMES, "failure_time", repr(time), f"must be one of {', '.join(FAILURE_TIMES)}")
+
+
+class Flights(NamedTuple):
+    """What is drawn for n flights. Nothing of it but r and v is shown to a policy."""
+
+    r: np.ndarray  # (3, n) m, at the start
+    v: np.ndarray  # (3, n) m/s, at the start
+    mass: np.ndarray  # (n,) kg, at the start
+    gravity: np.ndarray  # (3, n) m/s^2
+    failed: np.ndarray  # (3, n) effectiveness of each axis once the failure has struck; 1 in a healthy flight
+    strike: np.ndarray  # (n,) s, when it strikes; infinite in a healthy flight
+
+
+# a draw is a row of numbers from 0 to 1, all alike likely
+DRAW = ("x", "y", "z", "vx", "vy", "vz", "mass", "gx", "gy", "gz", "failure", "axis", "moment")
+
+
+def flights(lander: Lander, draw: np.ndarray, probability: float, size: float, time: str) -> Flights:
+    """The flights of draws (n, 13).
+
+    A failure is there where the draw's "failure" is below `probability`. It divides the thrust along x ("axis" below
+    0.5) or y by `size`, and along z by 1.5.
+    """
+    start, spread = np.array(lander.start), np.array(lander.spread)
+    centred = 2 * draw - 1
+    state = start + spread * centred[:, :6]
+    gravity = lander.gravity * lander.gravity_spread * centred[:, 7:10]
+    gravity[:, 2] -= lander.gravity
+    has_failed = draw[:, 10] < probability
+    axis = (draw[:, 11] >= 0.5).astype(int)
+    failed = np.ones((len(draw), 3))
+    rows = np.flatnonzero(has_failed)
+    failed[rows, axis[rows]] = 1 / size
+    failed[rows, 2] = 1 / VERTICAL_LOSS
+    moment = LAST_FAILURE * draw[:, 12] if time == "random" else np.zeros(len(draw))
+    strike = np.where(has_failed, moment, np.inf)
+    mass = lander.mass * (1 + lander.mass_spread * centred[:, 6])
+    return Flights(state[:, :3].T.copy(), state[:, 3:].T.copy(), mass, gravity.T.copy(), failed.T.copy(), strike)
+
+
+MARS = Lander(
+    mass=2000.0,
+    dry_mass=200.0,
+    isp=210.0,
+    least_thrust=4000.0,
+    greatest_thrust=24000.0,
+    start=(1000.0, 0.0, 2350.0, -40.0, 0.0, -80.0),
+    spread=(1000.0, 1000.0, 50.0, 30.0, 30.0, 10.0),
+    mass_spread=0.05,
+    gravity_spread=0.05,
+    failure_probability=0.5,
+)
+
+CANT = 27.0
+POWERED_DESCENT = Lander(  # six engines of 3100 N, throttled between 0.3 and 0.8
+    mass=1905.0,
+    dry_mass=1505.0,
+    isp=225.0,
+    g0=9.807,
+    cant=CANT,
+    least_thrust=0.3 * 6 * 3100.0 * math.cos(math.radians(CANT)),
+    greatest_thrust=0.8 * 6 * 3100.0 * math.cos(math.radians(CANT)),
+    start=(2000.0, 0.0, 1500.0, 100.0, 0.0, -75.0),
+)
+
+LANDERS: dict[str, Lander] = {}  # by environment id; `register_lander` of `environment.py` fills it

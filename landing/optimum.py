@@ -1,0 +1,469 @@
+"""Reference optima of the landers by IPOPT: the least propellant, knowing a flight's mass, gravity and failure.
+
+Reading order: a flight as it is solved, the nonlinear program, the solve from a guess, one flight's optimum and its
+replay by the environment, the references of many draws. CasADi is imported only where it is used.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ProcessPoolExecutor
+from functools import lru_cache
+from multiprocessing import get_context
+from typing import NamedTuple
+
+import numpy as np
+
+from common.batch import check_options
+from common.errors import NoOptimum
+from common.ipopt import SolveClock, interruptible, limit
+from landing.dynamics import TINY, burn
+from landing.environment import PERIOD, LanderVectorEnv, state_of
+from landing.lander import DRAW, LANDERS, Flights, Lander, check_failure, flights
+
+# ---------------------------------------------------------------------------------------------------------------------
+# A flight as it is solved
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+class Descent(NamedTuple):
+    """What is left of one flight, all of it known."""
+
+    state: np.ndarray  # (7,) r (m), v (m/s), m (kg) at its beginning
+    gravity: np.ndarray  # (3,) m/s^2
+    failed: np.ndarray  # (3,) effectiveness of each axis once the failure has struck
+    strike: float  # s from the beginning on, when it does; infinite if never
+
+    @classmethod
+    def of(cls, flights: Flights, k: int) -> Descent:
+        """Flight k, from its start on."""
+        state = np.concatenate([flights.r[:, k], flights.v[:, k], flights.mass[[k]]])
+        strike = PERIOD * np.ceil(flights.strike[k] / PERIOD)  # the beginning of one of the environment's periods
+        return cls(state, flights.gravity[:, k], flights.failed[:, k], float(strike))
+
+    def effectiveness(self, begins: np.ndarray) -> np.ndarray:
+        """That of each axis in intervals that begin at these times (K,) in s, (K, 3)."""
+        has_struck = begins > self.strike - PERIOD / 2
+        return np.where(has_struck[:, None], self.failed, 1.0)
+
+
+class Trajectory(NamedTuple):
+    """A guess or solution: thrusts held between the times at which the states are."""
+
+    t: np.ndarray  # (K+1,) s
+    thrust: np.ndarray  # (K, 3) N, what acts on the lander
+    y: np.ndarray  # (K+1, 7)
+
+    @property
+    def seconds(self) -> float:
+        return float(self.t[-1])
+
+    @property
+    def fuel(self) -> float:
+        """kg."""
+        return float(self.y[0, 6] - self.y[-1, 6])
+
+    def thrust_at(self, times: np.ndarray) -> np.ndarray:
+        """(k, 3) at times (k,); the first and last ones are held beyond the ends."""
+        interval = np.searchsorted(self.t, times, side="right") - 1
+        return self.thrust[np.clip(interval, 0, len(self.thrust) - 1)]
+
+    def state_at(self, times: np.ndarray) -> np.ndarray:
+        """(k, 7) at times (k,), on straight lines between the states."""
+        return np.column_stack([np.interp(times, self.t, column) for column in self.y.T])
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The nonlinear program
+# ---------------------------------------------------------------------------------------------------------------------
+
+UNITS = np.array([1000.0] * 3 + [50.0] * 3 + [1000.0])  # m, m/s, kg: in them a state is of order 1
+BOX = 20.0  # units of r and v; far from any descent, it keeps IPOPT's first steps near the pad
+TOUCHDOWN = np.array([0.0, 0.0, -1e-7, 0.0, 0.0, -0.01])  # m and m/s; at rest it might miss the ground by rounding
+CLEARANCE = 0.1  # m, at the ends of periods: between them the path sags by up to 0.05 m
+LAST_APPROACH = 1.0  # s before touchdown, in which it may come nearer to the ground
+SHORTEST, LONGEST = 0.02, 10.0  # s, of an interval
+MAX_ITERATIONS = 300  # a landing that exists took 14 to 90
+
+
+class Mesh(NamedTuple):
+    """The intervals of a program, some of them of one unknown length."""
+
+    fixed: np.ndarray  # (K,) s, the lengths of the others, 0 in these
+    is_free: np.ndarray  # (K,)
+    longest: float  # s, bound of the unknown length
+
+    @classmethod
+    def stretched(cls, count: int, seconds: float, strike: float = 0.0) -> Mesh:
+        """Intervals of about like length where the landing takes `seconds`; those before the strike (s) are fixed."""
+        before = 0
+        if strike > 0:
+            before = min(max(round(count * strike / seconds), 1), count - 1)
+        is_free = np.arange(count) >= before
+        return cls(np.where(is_free, 0.0, strike / max(before, 1)), is_free, LONGEST)
+
+    @classmethod
+    def periods(cls, count: int) -> Mesh:
+        """The environment's, the last one cut short."""
+        is_last = np.arange(count) == count - 1
+        return cls(np.where(is_last, 0.0, PERIOD), is_last, PERIOD)
+
+    def times(self, length: float) -> np.ndarray:
+        """The ends (K+1,) of the intervals, s, for a length of the free ones."""
+        return np.append(0.0, np.cumsum(self.fixed + self.is_free * length))
+
+    def length(self, seconds: float) -> float:
+        """That of the free intervals where all together last `seconds`, within its bounds."""
+        return float(np.clip((seconds - self.fixed.sum()) / self.is_free.sum(), SHORTEST, self.longest))
+
+
+def interval_of(lander: Lander):
+    """An interval as a CasADi function, in `UNITS` and units of the greatest thrust.
+
+    (y, thrust, seconds, gravity, effectiveness) -> (y at its end, |thrust|^2, |command|^2)
+    """
+    import casadi as ca
+
+    y, thrust, seconds = ca.SX.sym("y", 7), ca.SX.sym("thrust", 3), ca.SX.sym("seconds")
+    gravity, effectiveness = ca.SX.sym("gravity", 3), ca.SX.sym("effectiveness", 3)
+    state = y * ca.DM(UNITS)
+    norm = ca.sqrt(ca.sumsqr(thrust) + 1e-16)  # at 0 the root has no derivative
+    flow = lander.greatest_thrust * norm / lander.exhaust
+    motion = state[:3], state[3:6], state[6], thrust / norm, flow, gravity, seconds
+    after = ca.vertcat(*burn(*motion, lander.exhaust, log1p=ca.log1p)) / ca.DM(UNITS)
+    norms = ca.sumsqr(thrust), ca.sumsqr(thrust / effectiveness)
+    return ca.Function("interval", [y, thrust, seconds, gravity, effectiveness], [after, *norms])
+
+
+@lru_cache(maxsize=100)  # of 5 MB each
+def landing_solver(lander: Lander, count: int, has_cone: bool):
+    """IPOPT for a landing in `count` intervals, built once per process.
+
+    Unknowns: the thrusts (3, count), the states (7, count) at the intervals' ends, the length of the free intervals.
+    Parameters: state, gravity, effectiveness (3, count), `Mesh.fixed`, `Mesh.is_free`, the tangent of the glide slope.
+    Minimises the propellant. Constraints: the states are continuous (7 count, = 0), |thrust|^2 and |command|^2 (count
+    each, bounded), with `has_cone` how high the ends of all intervals but the last are above the cone (count - 1).
+    """
+    import casadi as ca
+
+    thrust, y, length = ca.MX.sym("thrust", 3, count), ca.MX.sym("y", 7, count), ca.MX.sym("length")
+    state, gravity, tangent = ca.MX.sym("state", 7), ca.MX.sym("gravity", 3), ca.MX.sym("tangent")
+    effectiveness = ca.MX.sym("effectiveness", 3, count)
+    fixed, is_free = ca.MX.sym("fixed", 1, count), ca.MX.sym("is_free", 1, count)
+    before = ca.horzcat(state, y[:, :-1])
+    held = thrust, fixed + is_free * length, ca.repmat(gravity, 1, count), effectiveness
+    after, thrusts, commands = interval_of(lander).map(count)(before, *held)
+    constraints = [y - after, thrusts, commands]
+    if has_cone:
+        run = ca.sqrt(ca.sum1(y[:2, :-1] ** 2) + 1e-12)  # above the pad the root has no derivative
+        constraints.append(y[2, :-1] - tangent * run)
+    program = {
+        "x": ca.veccat(thrust, y, length),
+        "p": ca.veccat(state, gravity, effectiveness, fixed, is_free, tangent),
+        "f": state[6] - y[6, -1],
+        "g": ca.veccat(*constraints),
+    }
+    options = {
+        "print_time": False,
+        "ipopt.print_level": 0,
+        "ipopt.sb": "yes",
+        "ipopt.tol": 1e-10,
+        "ipopt.bound_relax_factor": 0,  # the default lets commands exceed the engine's limits
+        "ipopt.max_iter": MAX_ITERATIONS,
+        "ipopt.max_wall_time": limit["seconds"],
+    }
+    return ca.nlpsol("landing", "ipopt", program, options)
+
+
+def bounds_of(lander: Lander, mesh: Mesh, glide_slope: float | None, limits: tuple[float, float]) -> dict:
+    """The bounds of a program's unknowns and constraints, as `nlpsol` takes them; `limits` of the thrust in N."""
+    count = len(mesh.fixed)
+    low, high = np.full((count, 7), -BOX), np.full((count, 7), BOX)
+    low[:, 6] = lander.dry_mass / UNITS[6]
+    high[:, 6] = np.inf
+    if glide_slope is not None:
+        times = mesh.times(SHORTEST)
+        left = times[-1] - times[1:]  # s, at least
+        low[:, 2] = np.where(left > LAST_APPROACH, CLEARANCE / UNITS[2], 0.0)
+    low[-1, :6] = high[-1, :6] = TOUCHDOWN / UNITS[:6]
+    ones = np.ones(3 * count)
+    least, greatest = (np.array(limits) / lander.greatest_thrust) ** 2
+    lbg = np.concatenate([np.zeros(7 * count), np.full(count, least), np.full(count, -np.inf)])
+    ubg = np.concatenate([np.zeros(7 * count), np.full(count, np.inf), np.full(count, greatest)])
+    if glide_slope:
+        lbg = np.append(lbg, np.zeros(count - 1))
+        ubg = np.append(ubg, np.full(count - 1, np.inf))
+    return {
+        "lbx": np.concatenate([-ones, low.ravel(), [SHORTEST]]),
+        "ubx": np.concatenate([ones, high.ravel(), [mesh.longest]]),
+        "lbg": lbg,
+        "ubg": ubg,
+    }
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The solve from a guess
+# ---------------------------------------------------------------------------------------------------------------------
+
+NEWTON_STEPS = 25  # 8 are enough for almost all; each of the others at least halves the bracket
+
+
+def energy_optimal_time(r, v, gravity: float) -> np.ndarray:
+    """Time to go (n,) in s of the energy-optimal landing from r, v (n, 3), with |g| in m/s^2.
+
+    D'Souza, "An optimal guidance law for planetary landing" (AIAA 97-3709): the positive root t of
+
+        g^2/2 t^4 - 2 v.v t^2 - 12 v.r t - 18 r.r = 0,  which is  g t^2 / 2 = |3 r + v t|.
+
+    The second form has no differences of large numbers. With v^2 below 6 g |r|, as on all our descents, there is one
+    root. Newton's method, begun above it; a step that leaves the bracket is replaced by its middle.
+    """
+    distance, speed = np.linalg.norm(r, axis=1), np.linalg.norm(v, axis=1)
+    low = np.zeros(len(r))
+    high = (speed + np.sqrt(speed**2 + 6 * gravity * distance)) / gravity  # where g t^2 / 2 = 3 |r| + |v| t
+    t = high
+    for _ in range(NEWTON_STEPS):
+        aim = 3 * r + v * t[:, None]
+        size = np.linalg.norm(aim, axis=1) + TINY
+        excess = gravity / 2 * t**2 - size
+        slope = gravity * t - (v * aim).sum(axis=1) / size
+        high = np.where(excess >= 0, t, high)
+        low = np.where(excess < 0, t, low)
+        step = t - excess / np.where(slope > 0, slope, TINY)
+        t = np.where((step >= low) & (step <= high), step, (low + high) / 2)
+    return t
+
+
+def straight_line(lander: Lander, descent: Descent, seconds: float, count: int) -> Trajectory:
+    """A guess: r, v and m change evenly, under the thrust that stops the lander in this time."""
+    share = np.linspace(0, 1, count + 1)
+    thrust = descent.state[6] * (-descent.state[3:6] / seconds - descent.gravity)
+    norm = np.linalg.norm(thrust)
+    possible = np.clip(norm, 1.2 * lander.least_thrust, 0.8 * lander.greatest_thrust)
+    left = descent.state[6] - seconds * possible / lander.exhaust
+    end = np.append(TOUCHDOWN, max(left, 1.01 * lander.dry_mass))
+    y = descent.state + share[:, None] * (end - descent.state)
+    return Trajectory(seconds * share, np.tile(thrust * (possible / norm), (count, 1)), y)
+
+
+@interruptible()
+def solve_from_guess(
+    lander: Lander,
+    descent: Descent,
+    guess: Trajectory,
+    mesh: Mesh,
+    glide_slope: float | None = 0.0,
+    limits: tuple[float, float] | None = None,
+) -> Trajectory:
+    """The path of least propellant to the pad, with the engine's limits or others (N).
+
+    `glide_slope` in degrees: the path stays above this cone on the pad; 0: above the ground; None: anywhere. The
+    failure strikes at the beginning of an interval. Raises NoOptimum where IPOPT finds none.
+    """
+    count = len(mesh.fixed)
+    length = mesh.length(guess.seconds)
+    t = mesh.times(length)
+    thrust, y = guess.thrust_at((t[:-1] + t[1:]) / 2), guess.state_at(t[1:])
+    unknowns = [(thrust / lander.greatest_thrust).ravel(), (y / UNITS).ravel(), [length]]
+    effectiveness = descent.effectiveness(t[:-1])
+    tangent = np.tan(np.radians(glide_slope or 0.0))
+    parameters = [descent.state / UNITS, descent.gravity, effectiveness.ravel(), mesh.fixed, mesh.is_free, [tangent]]
+    solve = landing_solver(lander, count, bool(glide_slope))
+    bounds = bounds_of(lander, mesh, glide_slope, limits or (lander.least_thrust, lander.greatest_thrust))
+    solution = solve(x0=np.concatenate(unknowns), p=np.concatenate(parameters), **bounds)
+    status = solve.stats()["return_status"]
+    if status != "Solve_Succeeded":
+        raise NoOptimum(f"landing: IPOPT stopped with {status}")
+    found = solution["x"].full()[:, 0]
+    thrust = found[: 3 * count].reshape(count, 3) * lander.greatest_thrust
+    y = np.vstack([descent.state, found[3 * count : -1].reshape(count, 7) * UNITS])
+    return Trajectory(mesh.times(found[-1]), thrust, y)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The optimum of one flight, and its replay
+# ---------------------------------------------------------------------------------------------------------------------
+
+INTERVALS = 60  # of the solve that finds out how long the flight is
+DURATIONS = (0.8, 1.2, 0.6)  # guesses, in units of the energy-optimal time
+PERIODS_TRIES = 6  # numbers of periods, until the last one is within its bounds
+POSITION_TOLERANCE = 0.01  # m
+SPEED_TOLERANCE = 0.02  # m/s
+FUEL_TOLERANCE = 0.05  # kg; at full thrust 4 ms
+
+
+def stretched_optimum(lander: Lander, descent: Descent, glide_slope: float | None, clock: SolveClock) -> Trajectory:
+    """The optimum in `INTERVALS` that stretch, from the first guess that IPOPT takes there.
+
+    Where the lander is down before the failure strikes, the failure does not matter. Else the strike cuts the flight
+    into two arcs.
+    """
+    r, v = descent.state[None, :3], descent.state[None, 3:6]
+    energy_optimal = float(energy_optimal_time(r, v, lander.gravity)[0])
+    is_healthy = descent.strike > 0
+    known = descent._replace(strike=np.inf if is_healthy else 0.0)
+    failure = NoOptimum("landing: no time to solve it")
+    for share in DURATIONS:
+        line = straight_line(lander, descent, share * energy_optimal, INTERVALS)
+        try:
+            path = solve_from_guess(lander, known, line, Mesh.stretched(INTERVALS, line.seconds), glide_slope)
+            if is_healthy and descent.strike < path.seconds:
+                arcs = Mesh.stretched(INTERVALS, path.seconds, descent.strike)
+                path = solve_from_guess(lander, descent, path, arcs, glide_slope)
+            return path
+        except NoOptimum as error:
+            failure = error
+        clock.speak()
+        if not clock.seconds_left():
+            break
+    raise failure
+
+
+def held_optimum(
+    lander: Lander, descent: Descent, guess: Trajectory, glide_slope: float | None, clock: SolveClock
+) -> Trajectory:
+    """The optimum in the environment's periods. Where the last one ends at a bound, their number is changed by one."""
+    count = int(guess.seconds / PERIOD) + 1
+    tried: dict[int, Trajectory] = {}
+    failure = NoOptimum("landing: no time to solve it")
+    while count not in tried and len(tried) < PERIODS_TRIES and clock.seconds_left():
+        if count * PERIOD > lander.longest + 1e-9:
+            failure = NoOptimum(f"landing: it takes {guess.seconds:.1f} s, longer than a flight, {lander.longest:g} s")
+            break
+        try:
+            tried[count] = solve_from_guess(lander, descent, guess, Mesh.periods(count), glide_slope)
+        except NoOptimum as error:
+            failure = error
+            break
+        last = np.diff(tried[count].t)[-1]
+        count += int(last > PERIOD - 1e-4) - int(last < SHORTEST + 1e-4)
+        clock.speak()
+    if not tried:
+        raise failure
+    return min(tried.values(), key=lambda path: path.fuel)
+
+
+def optimise_landing(lander: Lander, flights: Flights, k: int, glide_slope: float | None = 0.0) -> dict:
+    """The least propellant that lands flight k, knowing its mass, gravity and failure.
+
+    Returns u (T, 3) N, the commands held for a period each, `fuel_kg`, `final_time` (s), and t (T+1,) and y (T+1, 7) of
+    the flight that the environment makes of them. `glide_slope` is that of `solve_from_guess`. A path that may go below
+    ground (None) has no such flight: it is shot through the dynamics instead. Raises NoOptimum where IPOPT finds none,
+    or the replay does not end at rest on the pad with the solution's propellant.
+    """
+    descent = Descent.of(flights, k)
+    clock = SolveClock("landing")
+    stretched = stretched_optimum(lander, descent, glide_slope, clock)
+    path = held_optimum(lander, descent, stretched, glide_slope, clock)
+    u = path.thrust / descent.effectiveness(path.t[:-1])
+    y, end = shot(lander, descent, path) if glide_slope is None else replayed(lander, flights, k, u)
+    position_error, speed = np.linalg.norm(y[-1, :3]), np.linalg.norm(y[-1, 3:6])
+    is_soft = position_error < POSITION_TOLERANCE and speed < SPEED_TOLERANCE
+    differs = len(y) != len(path.y) or not abs(path.y[-1, 6] - y[-1, 6]) < FUEL_TOLERANCE
+    fuel = float(y[0, 6] - y[-1, 6])
+    if differs or not is_soft:
+        solved = f"a solution of {path.seconds:.2f} s and {path.fuel:.3f} kg"
+        ends = f"after {end:.2f} s and {fuel:.3f} kg, {position_error:.2g} m from the pad with {speed:.2g} m/s"
+        raise NoOptimum(f"landing: the replay of {solved} ends {ends}")
+    return {"u": u, "fuel_kg": fuel, "final_time": end, "t": np.append(path.t[:-1], end), "y": y}
+
+
+def replayed(lander: Lander, flights: Flights, k: int, u: np.ndarray) -> tuple[np.ndarray, float]:
+    """The states (T+1, 7) of flight k under the commands u (T, 3), by the environment, and its time of touchdown."""
+    batch = LanderVectorEnv(lander)
+    start = np.concatenate([flights.r[:, k], flights.v[:, k]])
+    batch.reset(options={"x0": start[None]})
+    batch.flights = Flights(*(array[..., [k]] for array in flights))
+    batch.mass = flights.mass[[k]].copy()
+    y = [state_of(batch)[0]]
+    for command in u:
+        batch.advance(command[None] / lander.greatest_thrust)
+        y.append(state_of(batch)[0])
+        if batch.down[0]:
+            return np.array(y), float(batch.time[0])
+    raise NoOptimum(f"landing: the replay of a solution is {y[-1][2]:.2g} m above ground at its end")
+
+
+def shot(lander: Lander, descent: Descent, path: Trajectory) -> tuple[np.ndarray, float]:
+    """The states (T+1, 7) that a path's thrusts lead to, with no ground in their way, and its duration."""
+    y = [descent.state]
+    for thrust, seconds in zip(path.thrust, np.diff(path.t)):
+        norm = np.linalg.norm(thrust)
+        state = y[-1]
+        arguments = state[:3], state[3:6], state[6], thrust / norm, norm / lander.exhaust, descent.gravity, seconds
+        r, v, mass = burn(*arguments, lander.exhaust)
+        y.append(np.concatenate([r, v, [mass]]))
+    return np.array(y), path.seconds
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The references of many draws
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def references(env_id: str, draw: np.ndarray, processes: int = 1, **env_options) -> dict:
+    """The fuel optima of draws (n, 13): `fuel_kg` and `final_time` (n,), u (n, T, 3), y (n, T+1, 7), `solved` (n,).
+
+    Of the environment's options those of the failure matter. u and y are NaN behind a flight's last period, everything
+    where `solved` is False. What was asked for lately is remembered, in arrays that cannot be written to. Solves are
+    shared out to `processes`, which changes only the time. Raises NoOptimum where no draw has an optimum.
+    """
+    check_options(LanderVectorEnv, env_options)
+    lander = LANDERS[env_id]
+    probability = env_options.get("failure_probability")
+    size = env_options.get("failure_size")
+    failure = (
+        lander.failure_probability if probability is None else probability,
+        lander.failure_size if size is None else size,
+        env_options.get("failure_time", "start"),
+    )
+    check_failure(*failure)
+    rows = np.ascontiguousarray(draw, dtype=np.float64).tobytes()
+    return dict(kept_references(lander, rows, failure, processes))
+
+
+@lru_cache(maxsize=8)
+def kept_references(lander: Lander, rows: bytes, failure: tuple, processes: int) -> dict:
+    """As `references`; the draws are the bytes of their array. Equal flights are solved once."""
+    draw = np.frombuffer(rows).reshape(-1, len(DRAW))
+    drawn = flights(lander, draw, *failure)
+    _, first, of_draw = np.unique(np.vstack(drawn), axis=1, return_index=True, return_inverse=True)
+    jobs = [(lander, Flights(*(array[..., [k]] for array in drawn)), 0) for k in first]
+    found = solutions(jobs, processes)
+    optima = [found[k] for k in of_draw.ravel()]
+    solved = [optimum for optimum in optima if isinstance(optimum, dict)]
+    if not solved:
+        raise optima[0]
+    n, T = len(draw), max(len(optimum["u"]) for optimum in solved)
+    arrays = {
+        "fuel_kg": np.full(n, np.nan),
+        "final_time": np.full(n, np.nan),
+        "u": np.full((n, T, 3), np.nan),
+        "y": np.full((n, T + 1, 7), np.nan),
+        "solved": np.array([isinstance(optimum, dict) for optimum in optima]),
+    }
+    for k, optimum in zip(np.flatnonzero(arrays["solved"]), solved):
+        arrays["fuel_kg"][k] = optimum["fuel_kg"]
+        arrays["final_time"][k] = optimum["final_time"]
+        arrays["u"][k, : len(optimum["u"])] = optimum["u"]
+        arrays["y"][k, : len(optimum["y"])] = optimum["y"]
+    for array in arrays.values():
+        array.flags.writeable = False
+    return arrays
+
+
+def solutions(jobs: list, processes: int) -> list:
+    """What `solve_job` returns of each job, in their order."""
+    if processes == 1:
+        return [solve_job(job) for job in jobs]
+    chunk = -(-len(jobs) // (4 * processes))
+    spawn = get_context("spawn")
+    with ProcessPoolExecutor(processes, spawn, limit.update, ({"seconds": limit["seconds"]},)) as pool:
+        return list(pool.map(solve_job, jobs, chunksize=chunk))
+
+
+def solve_job(job) -> dict | NoOptimum:
+    """The optimum of (lander, flights, k), or why there is none."""
+    try:
+        return optimise_landing(*job)
+    except NoOptimum as error:
+        return error

@@ -1,0 +1,41 @@
+"""What a landing earns, and when a lander has landed. The conditions are the published ones, the rewards ours."""
+
+from __future__ import annotations
+
+import numpy as np
+
+# "landed": the published code's `landing_rlimit`, `landing_vlimit` and `landing_gslimit`
+POSITION_LIMIT = 5.0  # m
+SPEED_LIMIT = 2.0  # m/s
+SLOPE_LIMIT = 5.0  # fall over run, from the last position that was more than `SLOPE_HEIGHT` higher
+SLOPE_HEIGHT = 2.0  # m
+
+# of the reported return; a training may set others
+POSITION_SCALE = 0.1  # m
+SPEED_SCALE = 0.1  # m/s
+FAR = 100.0  # m
+FAST = 10.0  # m/s
+FUEL_PRICE = 1.0  # for 100 kg
+ALOFT_PRICE = 10.0  # where a flight ends in the air
+SLOPE_PRICE = 2.0
+FLATTEST = 0.05  # a flatter slope costs no more
+
+
+def has_landed(position_error, speed, slope, is_down):
+    """Whether flights have landed by the published conditions, (n,)."""
+    return is_down & (position_error < POSITION_LIMIT) & (speed < SPEED_LIMIT) & (slope > SLOPE_LIMIT)
+
+
+def terminal_reward(position_error, speed, position_scale, speed_scale):
+    """-ln(1 + |r| / position_scale) - ln(1 + |v| / speed_scale) - |r| / 100 m - |v| / 10 m/s.
+
+    Each halving of an error pays the same. Two logarithms and not one of a norm: the larger error does not hide the
+    smaller one. The linear terms outweigh the propellant that a crash at high speed saves.
+    """
+    near = np.log1p(position_error / position_scale) + np.log1p(speed / speed_scale)
+    return -near - position_error / FAR - speed / FAST
+
+
+def slope_reward(slope, price):
+    """-price (1 / slope - 1 / 7), not above 0: run over fall. It asks for a little more than the limit of 1 / 5."""
+    return -price * np.maximum(1 / np.maximum(slope, FLATTEST) - 1 / 7, 0.0)

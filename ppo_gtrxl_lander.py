@@ -1,0 +1,779 @@
+"""PPO with a Gated Transformer-XL on a landing with a hidden engine failure, measured against the true optimum.
+
+    python ppo_gtrxl_lander.py --seed 1                                # by our recipe, as results/mars_landing
+    python ppo_gtrxl_lander.py --seed 1 --failure-time random          # the failure strikes within the first 40 s
+    python ppo_gtrxl_lander.py --seed 1 --env-id PoweredDescent-v0     # nothing is hidden
+    python ppo_gtrxl_lander.py --eval-only --checkpoint results/mars_landing/agent.safetensors
+
+Top to bottom: arguments, recipes, problem, Gated Transformer-XL, agent, PPO, what we add to it, training, main.
+From the first "Shared" on, all ppo_gtrxl_*.py are the same to the letter. A section with "ours" in its heading has
+nothing from the paper; elsewhere a comment says so. T steps, N environments (Algorithm 1 calls these E, and its
+iterations N), L memory length, d width, H heads, dk = d / H.
+
+The paper names landing and does not fly it: this problem is that of Gaudet, Linares and Furfaro (landing/lander.py).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import nn
+from torch.distributions import Normal
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+
+import runs
+from cuda_graphs import speed_up
+from envs import LANDERS
+from landing.rewards import POSITION_SCALE, SPEED_SCALE
+from runs import Schedule, all_reduce_sum
+
+
+@dataclass
+class Args:
+    """The flags. The values written here are Table 1's column of the rocket: --recipe paper uses them as they are.
+
+    --recipe ours, the default, first replaces those in RECIPES. A flag that is typed wins over both. A Schedule is one
+    number, or points "place:value place:value ...": place 0 is the first update, 1 the last (`value_at` reads it).
+    """
+
+    # experiment
+    exp_name: str = Path(__file__).stem  # the name of this experiment
+    seed: int = 1  # seed of the experiment
+    recipe: str = "ours"  # the flags that are not typed: "ours" (RECIPES, then these) or "paper" (these)
+    torch_deterministic: bool = True  # if toggled, `torch.backends.cudnn.deterministic=True`
+    cuda: bool = True  # if toggled, a GPU is used when there is one
+    num_threads: int = 1  # CPU threads of torch (0: torch's own choice); bits depend on it
+    torch_compile: bool = False  # compile the network, on a GPU into CUDA graphs: a slow start, then quick updates
+    track: bool = False  # if toggled, this experiment will be tracked with Weights and Biases
+    wandb_project_name: str = "ppo-gtrxl"  # the wandb's project name
+    wandb_entity: str | None = None  # the entity (team) of wandb's project
+    capture_video: bool = False  # draw the final evaluation into the run's folder: animation.gif and the figures
+    save_model: bool = True  # write checkpoints and the evaluation (off: TensorBoard events only)
+    checkpoint: str | None = None  # start from these weights (.safetensors)
+    resume: str | None = None  # run folder of an interrupted run to go on with, bit for bit
+    eval_only: bool = False  # fly the mean action of --checkpoint, train nothing, write only --eval-json and --eval-npz
+    eval_starts: int | None = None  # drawn flights of the evaluation (default 10000; 100 in a training cut short)
+    eval_seed: int = 0  # seed of the evaluation starts
+    eval_json: str | None = None  # where --eval-only writes the metrics
+    eval_npz: str | None = None  # where --eval-only writes the trajectories
+    eval_every: int = 10  # evaluate every so many updates, on draws of its own (0: only at the end)
+
+    # environment
+    env_id: str = "MarsLanding-v0"  # the id of the environment, one of ENV_IDS
+    observe_phase: bool = True  # show the time to the policy
+    observe_velocity: bool = True  # show the velocity to the policy
+    observe_command: bool = True  # show the command of the step before to the policy
+    observe_draw: bool = False  # show mass, gravity and failure to the policy, which no real flight could know
+    failure_probability: float = 0.5  # of a hidden failure
+    failure_size: float = 2.5  # what it divides the thrust along one lateral axis by, in evaluations
+    failure_time: str = "start"  # when it strikes: "start", or "random", within the first 40 s
+    decision_s: float = 0.2  # seconds between two commands of the policy, a multiple of 0.2
+    longest_flight: float = 100.0  # seconds in which a flight has to land
+
+    # Table 1, the column of the rocket
+    num_blocks: int = 6  # number of GTrXL blocks (0: a plain MLP, without memory)
+    embed_dim: int = 384  # embedding dimension d
+    num_heads: int = 8  # number of attention heads
+    memory_length: int = 256  # memory length L: a step attends to itself and the L steps before it
+    mlp_dim: int = 384  # width of the position-wise MLP
+    hidden_dim: int = 384  # width of the hidden layer of each head
+    gamma: float = 0.99  # the discount factor gamma
+    gae_lambda: Schedule = 0.95  # the lambda for the general advantage estimation
+    total_updates: int = 5000  # number of updates
+    update_epochs: int = 16  # the K epochs to update the policy
+    vf_coef: float = 0.8  # coefficient of the value function
+    learning_rate: Schedule = "0:1e-4 1:5e-6"  # the learning rate of the optimizer
+    ent_coef: Schedule = "0:1e-3 1:1e-4"  # coefficient of the entropy
+    clip_coef: float = 0.12  # the surrogate clipping coefficient
+
+    # not in Table 1: our choice
+    num_envs: int = 32  # parallel environments, one episode each per update
+    num_minibatches: int = 8  # the number of mini-batches of whole episodes
+    norm_adv: bool = True  # normalise the advantages over an update
+    max_grad_norm: float = 0.5  # the maximum norm for the gradient clipping
+    target_kl: float | None = None  # the KL divergence from which an update takes no further step (none: no limit)
+    log_std: Schedule = -1.4  # log of the std in the action's unit. A number: learned from there; points: not learned
+    memory_noise: Schedule = 0.1  # std of the memory before an episode (Algorithm 1, line 5; the text says "small")
+    reward_scale: float = 0.2  # factor on the rewards in training; losses are logged with it, returns without
+
+    # ours: off here, on in RECIPES
+    lr_times_std: bool = False  # the learning rate is --learning-rate times the policy's std
+    flights_per_start: Schedule = 1  # flights of each draw, compared with one another
+    fuel_weight: Schedule = 1.0  # reward lost for 100 kg of propellant in training
+    slope_weight: Schedule = 2.0  # weight of a flat last descent in training (`slope_reward` of landing/rewards.py)
+    training_failure_size: float = 2.0  # --failure-size in training, as published
+    weight_average: float = 0.0  # decay, per optimiser step, of the averaged weights used in evaluation
+
+
+# Recipes: the values that we replace (beside Table 1's: docs/decisions.md; trials: docs/training-notes.md) ------------
+OURS = {
+    "num_blocks": 2,  # a laptop's network, a hundredth of Table 1's weights
+    "embed_dim": 64,
+    "num_heads": 4,
+    "memory_length": 8,  # steps of 1 s; with 32 it learns more slowly what has failed
+    "mlp_dim": 64,
+    "hidden_dim": 64,
+    "total_updates": 1000,
+    "num_envs": 256,
+    "flights_per_start": 32,
+    "update_epochs": 4,
+    "learning_rate": 3e-3,
+    "lr_times_std": True,
+    "gamma": 1.0,
+    "gae_lambda": "0:0.97 1:1",
+    "clip_coef": 0.2,
+    "vf_coef": 0.5,
+    "target_kl": 0.03,
+    "memory_noise": "0:0.01 1:0",
+    "log_std": "0:-1 0.6:-2.5 1:-4.5",
+    "fuel_weight": 4.0,
+    "slope_weight": "0:0 0.3:0 0.6:3",  # not before the pad is reached: a steep crash is a crash
+    "weight_average": 0.998,
+    "decision_s": 1.0,  # with 0.2 an episode has five times the steps, and noise that is new in each moves less
+}
+MARS = {**OURS, "longest_flight": 60.0}  # flights of learned policies take 45 s
+ONE_START = {  # all flights of an update are compared
+    **OURS,
+    "total_updates": 500,
+    "num_envs": 64,
+    "flights_per_start": 64,
+    "failure_probability": 0.0,
+}
+RECIPES = {"MarsLanding-v0": MARS, "PoweredDescent-v0": ONE_START}
+
+
+def recipe(args):
+    """What our recipe changes for the environments of `args`; a lander of your own takes one of two."""
+    own = ONE_START if LANDERS[args.env_id].has_one_flight else OURS
+    return RECIPES.get(args.env_id, own)
+
+
+# Problem: input and action (features and first action are ours) -------------------------------------------------------
+ENV_IDS = tuple(LANDERS)
+ENV_OPTIONS = (  # arguments of the environments
+    "observe_phase", "observe_velocity", "observe_command", "observe_draw",
+    "failure_probability", "failure_size", "failure_time", "decision_s", "longest_flight",
+)  # fmt: skip
+FIXED_OPTIONS = {}  # those that no flag sets
+BUFFERS = {env_id: {"gravity": lander.gravity} for env_id, lander in LANDERS.items()}  # read as agent.<name>
+INITIAL_ACTION = [0.0, 0.0, 0.4]  # straight up, a little more than the weight
+OBSERVED = 10  # numbers that every lander shows: r, v, time, command; the draw comes after them
+
+
+def features(agent, obs):
+    """What the encoder sees (..., inputs) of observations (..., 10 or more). Every feature is ours, in this order:
+
+    - position, velocity, time, the last command, the draw with --observe-draw
+    - position and velocity by asinh, in which small ones show
+    - the time t = 2 h / (1 m/s - vz) in which an even braking ends at height 0, and what an even acceleration has to
+      be, over gravity's: of vertical speed vz^2 / (2 h), of lateral position r / t^2 and velocity v / t
+    """
+    r, v, time, command, draw = obs.split([3, 3, 1, 3, obs.shape[-1] - OBSERVED], dim=-1)
+    height, fall = r[..., 2:].clamp(min=0.0), (-v[..., 2:]).clamp(min=0.0)
+    left = 2 * height / (1 + fall) + 0.5
+    braking = fall**2 / (2 * height + 1) / agent.gravity
+    shift = r[..., :2] / left**2 / agent.gravity
+    stop = v[..., :2] / left / agent.gravity
+    seen = [r / 1000, v / 20, time / 60, command, draw, (r / 2).asinh() / 4, v.asinh() / 3]
+    seen += [left / 30, braking.asinh(), shift.asinh(), stop.asinh()]
+    return torch.cat(seen, dim=-1)
+
+
+def mean_action(output, action_scale):
+    """The policy's mean: a vector of the output's direction whose length has a bound, the greatest thrust."""
+    norm = output.norm(dim=-1, keepdim=True).clamp(min=1e-6)
+    return output * (norm.tanh() / norm)
+
+
+def describe(episodes, metrics):
+    """What a progress line says of the sampled episodes (`final_info` arrays) and of the last evaluation, if any."""
+    position, speed = np.median(episodes["position_error"]), np.median(episodes["speed"])
+    line = f"return {episodes['episodic_return'].mean():7.2f}  sampled {position:6.2f} m {speed:5.2f} m/s"
+    line += f"  down {episodes['down'].mean():4.0%}  fuel {episodes['fuel_kg'].mean():5.1f} kg"
+    if not metrics:
+        return line
+    position, speed = metrics["position_error_mean_m"], metrics["speed_mean_m_s"]
+    mean = f"{position:.2f} m {speed:.2f} m/s  landed {metrics['landed_rate']:.1%}"
+    return f"{line}  mean action: {mean}  fuel x {metrics['fuel_ratio']:.3f}"
+
+
+# Problem, ours: what only training changes ----------------------------------------------------------------------------
+ALOFT_PRICE = 20.0  # hovering above the pad must cost more than any miss
+SINK_RATE = 0.3  # m/s; a policy that aims at rest on the ground comes to rest above it, half the time
+
+
+def set_curriculum(envs, args, progress):
+    """Set what only training changes; returns how many flights in a row have the same draw.
+
+    The terminal reward tells errors apart above its scales alone. Noise scatters flights in proportion to its std. So
+    the scales fall with the noise if --log-std is a schedule, to the reported ones.
+    """
+    if isinstance(args.log_std, str):
+        std = math.exp(value_at(args.log_std, progress))
+        envs.position_scale = max(100 * std, POSITION_SCALE)
+        envs.speed_scale = max(10 * std, SPEED_SCALE)
+    envs.fuel_price = value_at(args.fuel_weight, progress)
+    envs.slope_price = value_at(args.slope_weight, progress)
+    envs.aloft_price = ALOFT_PRICE
+    envs.sink_rate = SINK_RATE
+    envs.failure_size = args.training_failure_size
+    group = round(value_at(args.flights_per_start, progress))
+    envs.flights_per_start = group
+    return group
+
+
+def add_rewards(envs, args, progress, batch, episodes):
+    """Nothing to do here: training is paid what the environment pays. The rocket's script adds to it."""
+
+
+def before_training(agent, args, env_options):
+    """Nothing to do here. The rocket's script prepares its agent for flights that differ."""
+
+
+# Shared: Gated Transformer-XL ("Gated Transformer-XL Implementation") -------------------------------------------------
+def linear(inputs, outputs, gain=1.0, bias=0.0):
+    """A linear layer with orthogonal weights and a constant bias (CleanRL's layer_init), or without one (None)."""
+    layer = nn.Linear(inputs, outputs, bias=bias is not None)
+    nn.init.orthogonal_(layer.weight, gain)
+    if bias is not None:
+        nn.init.constant_(layer.bias, bias)
+    return layer
+
+
+class Gate(nn.Module):
+    """gate(x, y) = lambda x + (1 - lambda) y, lambda = sigmoid(W_g [x, y] + b_g); b_g > 0 begins near the identity."""
+
+    def __init__(self, embed_dim):
+        super().__init__()
+        self.linear = linear(2 * embed_dim, embed_dim, bias=2.0)
+
+    def forward(self, x, y):
+        lam = torch.sigmoid(self.linear(torch.cat([x, y], dim=-1)))
+        return torch.lerp(y, x, lam)
+
+
+class RelativeAttention(nn.Module):
+    """Multi-head attention over a sliding window: A_ij = (x_i W^Q) (x_j W^K + R_{i-j})^T / sqrt(d_k), i - L <= j <= i.
+
+    R is learned, one vector for each head and distance 0..L; j runs over the memory and the episode.
+    """
+
+    def __init__(self, embed_dim, num_heads, memory_length):
+        super().__init__()
+        self.num_heads = num_heads
+        self.memory_length = memory_length
+        self.dk = embed_dim // num_heads
+        self.query = linear(embed_dim, embed_dim, bias=None)  # W^Q
+        self.key = linear(embed_dim, embed_dim, bias=None)  # W^K
+        self.value = linear(embed_dim, embed_dim, bias=None)  # W^V
+        self.out = linear(embed_dim, embed_dim, bias=None)
+        self.R = nn.Parameter(torch.zeros(num_heads, memory_length + 1, self.dk))
+
+    def forward(self, x, memory):
+        """MultiHead(x) of whole episodes: x (N, T, d), memory (N, L, d) -> (N, T, d).
+
+        The queries are cut into chunks of C <= max(L / 2, 64) steps. Each chunk sees a window of L + C keys, so the
+        cost grows linearly with T.
+        """
+        N, T, d = x.shape
+        L, H, dk = self.memory_length, self.num_heads, self.dk
+        chunks = math.ceil(T / max(L // 2, 64))
+        C = math.ceil(T / chunks)
+        pad = (0, 0, 0, chunks * C - T)  # steps after the last, so that every chunk has C
+        context = torch.cat([memory, x], dim=1)  # (N, L + T, d)
+
+        q = F.pad(self.query(x) / math.sqrt(dk), pad)  # (N, chunks * C, d)
+        q = q.view(N, chunks, C, H, dk).transpose(2, 3)  # (N, chunks, H, C, dk)
+
+        k = F.pad(self.key(context), pad).unfold(1, L + C, C)  # (N, chunks, d, L + C), one window a chunk
+        k = k.unflatten(2, (H, dk))  # (N, chunks, H, dk, L + C)
+        v = F.pad(self.value(context), pad).unfold(1, L + C, C)
+        v = v.unflatten(2, (H, dk))
+
+        scores = q @ k + self.position_scores(q)  # (N, chunks, H, C, L + C)
+        attended = scores.softmax(dim=-1) @ v.transpose(-1, -2)  # (N, chunks, H, C, dk)
+        attended = attended.transpose(2, 3).reshape(N, chunks * C, d)
+        return self.out(attended[:, :T])
+
+    def position_scores(self, q):
+        """q_i R_{i-j}^T of q (N, chunks, H, C, dk) for all keys of its window: (..., C, L + C), -inf out of reach.
+
+        Key i + L of a window is query i itself, so query i reaches the keys i to i + L. `products` has a row for each
+        query and a column for each distance, L first: row i has to move right by i. One reshape does it: pad each row
+        with C columns of -inf, join the rows to one line, and cut that into rows which are one column shorter. For
+        L = 2, C = 3 (a2: query a at distance 2; ".": -inf):
+
+            a2 a1 a0 .  .  .        a2 a1 a0 .  .
+            b2 b1 b0 .  .  .   ->   .  b2 b1 b0 .
+            c2 c1 c0 .  .  .        .  .  c2 c1 c0
+        """
+        C, L = q.shape[-2], self.memory_length
+        products = torch.einsum("nchqd,hld->nchql", q, self.R.flip(1))  # (N, chunks, H, C, L + 1)
+        line = F.pad(products, (0, C), value=-torch.inf).flatten(-2)  # (N, chunks, H, C * (L + 1 + C))
+        return line[..., : C * (L + C)].unflatten(-1, (C, L + C))
+
+    def start_cache(self, memory, steps):
+        """What `step` needs, for episodes of at most `steps` steps with the memory (N, L, d):
+
+        - kv (2, N, H, L + steps, dk), keys and values: the memory's, then room for those of the steps
+        - the projections W^Q / sqrt(dk), W^K and W^V as one matrix (3 d, d)
+        - R (H, L + 1, dk), distance L first, as the window's keys are ordered
+        """
+        kv = torch.stack([self.key(memory), self.value(memory)])  # (2, N, L, d)
+        kv = kv.unflatten(-1, (self.num_heads, self.dk)).transpose(2, 3)  # (2, N, H, L, dk)
+        kv = F.pad(kv, (0, 0, 0, steps))
+        projections = torch.cat([self.query.weight / math.sqrt(self.dk), self.key.weight, self.value.weight])
+        return kv, projections, self.R.flip(1)
+
+    def step(self, x, cache, t):
+        """Step t alone: x (N, d) -> (N, d); writes its key and value into the cache, reads the window before it."""
+        kv, projections, R = cache
+        L = self.memory_length
+        qkv = F.linear(x, projections)  # (N, 3 d)
+        qkv = qkv.view(len(x), 3, self.num_heads, 1, self.dk).transpose(0, 1)  # (3, N, H, 1, dk)
+        kv[:, :, :, t + L : t + L + 1] = qkv[1:]
+        k, v = kv[:, :, :, t : t + L + 1]  # (N, H, L + 1, dk)
+        scores = qkv[0] @ (k + R).transpose(-1, -2)  # (N, H, 1, L + 1)
+        attended = scores.softmax(dim=-1) @ v  # (N, H, 1, dk)
+        return self.out(attended.flatten(1))
+
+
+class GTrXLBlock(nn.Module):
+    """h1 = gate(x, LayerNorm(x + MultiHead(x))), h2 = gate(h1, LayerNorm(h1 + MLP(h1)))."""
+
+    def __init__(self, embed_dim, num_heads, memory_length, mlp_dim):
+        super().__init__()
+        self.attention = RelativeAttention(embed_dim, num_heads, memory_length)
+        self.norm1 = nn.LayerNorm(embed_dim)
+        self.norm2 = nn.LayerNorm(embed_dim)
+        self.gate1 = Gate(embed_dim)
+        self.gate2 = Gate(embed_dim)
+        self.mlp = nn.Sequential(linear(embed_dim, mlp_dim), nn.GELU(), linear(mlp_dim, embed_dim))
+
+    def forward(self, x, attended):
+        """x is the block's input, `attended` its MultiHead(x), of the whole segment or of one step."""
+        h1 = self.gate1(x, self.norm1(x + attended))
+        return self.gate2(h1, self.norm2(h1 + self.mlp(h1)))
+
+
+# Shared: agent ("Architecture Overview": encoder, GTrXL, policy head, value head) -------------------------------------
+LOG_STD_RANGE = (-8.0, 0.5)
+
+
+class Agent(nn.Module):
+    """Actor and critic on one GTrXL trunk. The Gaussian policy has one log-std for all states, learned or set.
+
+    A block's memory at step t is what the block received at the steps t - L to t - 1, and m_0 before the first step.
+    A rollout stores it as keys and values (`encode_step`). Training stores only m_0, and computes the whole episode
+    again from it with the current weights (`encode`); so gradients flow through the memory. This replaces lines 10, 11
+    and 17. Line 10 also stores the action a_t. We leave it out: two states that are fully observed tell the action.
+    """
+
+    def __init__(self, args, envs):
+        super().__init__()
+        d, hidden = args.embed_dim, args.hidden_dim
+        actions = envs.single_action_space.shape[0]
+        self.num_blocks = args.num_blocks
+        self.memory_length = args.memory_length
+        self.embed_dim = d
+
+        # buffers of the problem, saved with the weights; `features` and `mean_action` read them as agent.<name>
+        constants = {**BUFFERS[args.env_id], "action_scale": envs.single_action_space.high.tolist()}
+        for name, value in constants.items():
+            self.register_buffer(name, torch.tensor(value))
+        any_observation = torch.ones(envs.single_observation_space.shape)  # only the number of its features is used
+        inputs = len(features(self, any_observation))
+
+        self.encoder = nn.Sequential(linear(inputs, d, gain=2**0.5), nn.GELU())
+        blocks = [GTrXLBlock(d, args.num_heads, args.memory_length, args.mlp_dim) for _ in range(args.num_blocks)]
+        self.blocks = nn.ModuleList(blocks)
+        self.actor = nn.Sequential(linear(d, hidden, gain=2**0.5), nn.GELU(), linear(hidden, actions, gain=0.01))
+        self.actor[-1].bias.data[:] = torch.tensor(INITIAL_ACTION)
+        self.critic = nn.Sequential(linear(d, hidden, gain=2**0.5), nn.GELU(), linear(hidden, 1))
+        learned = not isinstance(args.log_std, str)  # a number: learned from there; points: set by them
+        self.actor_logstd = nn.Parameter(torch.full((actions,), value_at(args.log_std, 0.0)), requires_grad=learned)
+
+    def new_memory(self, num_envs, noise):
+        """m_0 ~ N(0, noise^2), drawn once per episode and block: (blocks, N, L, d)."""
+        zeros = self.actor_logstd.new_zeros(self.num_blocks, num_envs, self.memory_length, self.embed_dim)
+        return zeros.normal_(std=noise) if noise else zeros  # without noise nothing is drawn
+
+    def encode(self, obs, memory):
+        """Whole episodes in parallel (training): obs (N, T, obs), memory (blocks, N, L, d) -> hidden (N, T, d)."""
+        x = self.encoder(features(self, obs))
+        for block, block_memory in zip(self.blocks, memory):
+            x = block(x, block.attention(x, block_memory))
+        return x
+
+    @torch.no_grad()
+    def start_cache(self, memory, steps):
+        """The key/value caches with which `encode_step` begins episodes of at most `steps` steps."""
+        return [block.attention.start_cache(m, steps) for block, m in zip(self.blocks, memory)]
+
+    def encode_step(self, obs, cache, t):
+        """Step t of the same episodes (rollout): obs (N, obs) -> hidden (N, d); its cost does not grow with t."""
+        x = self.encoder(features(self, obs))
+        for block, block_cache in zip(self.blocks, cache):
+            x = block(x, block.attention.step(x, block_cache, t))
+        return x
+
+    def get_mean_action(self, hidden):
+        """What evaluation flies: the policy without its noise."""
+        return mean_action(self.actor(hidden), self.action_scale)
+
+    def get_policy(self, hidden):
+        """The Gaussian that training samples from, of hidden (..., d): over actions (..., actions), in their unit."""
+        mean = self.get_mean_action(hidden)
+        std = self.actor_logstd.clamp(*LOG_STD_RANGE).exp()
+        return Normal(mean, std.expand_as(mean), validate_args=False)
+
+    def act(self, obs, cache, t):
+        """Step t of a rollout: hidden (N, d) and sampled actions (N, actions) of obs (N, obs)."""
+        hidden = self.encode_step(obs, cache, t)  # lines 7 and 10
+        return hidden, self.get_policy(hidden).rsample()  # line 8; a GPU would be waited for by `sample`
+
+    def evaluate_actions(self, hidden, actions):
+        """log pi(a|s), entropy and critic's output, (...) each, of hidden (..., d) and actions (..., actions)."""
+        probs = self.get_policy(hidden)
+        logprob = probs.log_prob(actions).sum(-1)
+        entropy = probs.entropy().sum(-1)
+        value = self.critic(hidden).squeeze(-1)
+        return logprob, entropy, value
+
+    def make_policy(self, steps):
+        """The function policy(obs (N, obs), t) -> mean actions (N, actions), in NumPy, that evaluation flies.
+
+        At t = 0 it begins new episodes, with a memory of zeros.
+        """
+        dtype, device = self.actor_logstd.dtype, self.actor_logstd.device
+        cache = []
+
+        @torch.no_grad()
+        def policy(obs, t):
+            if t == 0:
+                cache[:] = self.start_cache(self.new_memory(len(obs), noise=0.0), steps)
+            hidden = self.encode_step(torch.as_tensor(obs, dtype=dtype, device=device), cache, t)
+            return self.get_mean_action(hidden).cpu().numpy()
+
+        return policy
+
+
+# Shared: PPO (Algorithm 1) --------------------------------------------------------------------------------------------
+@dataclass
+class Batch:
+    """The episodes of one update; `alive` is 1 up to an episode's last step, 0 after it."""
+
+    obs: torch.Tensor  # (T, N, obs)
+    actions: torch.Tensor  # (T, N, actions)
+    logprobs: torch.Tensor  # (T, N)
+    rewards: torch.Tensor  # (T, N), scaled
+    critic: torch.Tensor  # (T, N), its output; V of `returns_baseline` is made of it
+    alive: torch.Tensor  # (T, N)
+    memory: torch.Tensor  # (blocks, N, L, d), m_0
+    advantages: torch.Tensor | None = None  # (T, N), set by train
+    targets: torch.Tensor | None = None  # (T, N), set by train: what the critic learns
+
+
+@torch.no_grad()
+def rollout(agent, envs, reward_scale, memory_noise):
+    """Fly one episode in each environment (lines 3-13): this process's Batch, and all processes' `final_info`."""
+    T, N = envs.episode_steps, envs.num_envs
+    zeros = agent.actor_logstd.new_zeros  # on the agent's device, in its precision
+    batch = Batch(
+        obs=zeros(T, N, *envs.single_observation_space.shape),
+        actions=zeros(T, N, *envs.single_action_space.shape),
+        logprobs=zeros(T, N),  # set after the flight
+        rewards=zeros(T, N),  # set after the flight
+        critic=zeros(T, N),  # set after the flight
+        alive=zeros(T, N),  # set after the flight
+        memory=agent.new_memory(N, memory_noise),  # line 5
+    )
+    cache = agent.start_cache(batch.memory, T)
+    hidden = zeros(T, N, agent.embed_dim)
+    rewards = np.zeros((T, N))
+    alive_at = np.zeros((T, N))
+    alive = np.ones(N, dtype=bool)
+    episodes = {}  # `final_info` of each environment's first episode
+    next_obs, _ = envs.reset()
+    batch.obs[:] = torch.as_tensor(next_obs)  # after the last episode's end: features of zeros could be NaN
+
+    for t in range(T):  # line 6
+        batch.obs[t] = torch.as_tensor(next_obs)
+        alive_at[t] = alive
+        hidden[t], batch.actions[t] = agent.act(batch.obs[t], cache, t)  # lines 7, 8 and 10
+        # line 9; an episode's end is a true end: V is 0 there, and nothing is ever truncated
+        next_obs, reward, terminated, _, info = envs.step(batch.actions[t].cpu().numpy())
+        rewards[t] = reward * alive * reward_scale
+        ended = alive & terminated
+        for key, value in info.get("final_info", {}).items():
+            first_episodes = episodes.setdefault(key, np.zeros_like(value))
+            first_episodes[ended] = value[ended]
+        alive = alive & ~terminated  # an ended environment has started anew; only its first episode counts
+        if not alive.any():
+            break
+
+    batch.rewards[:] = torch.as_tensor(rewards)
+    batch.alive[:] = torch.as_tensor(alive_at)
+    # v_t of line 8 and log pi(a_t), for all steps in one call: sampling needs neither
+    batch.logprobs, _, batch.critic = agent.evaluate_actions(hidden, batch.actions)
+    of_each_process = runs.all_gather(episodes)
+    all_episodes = {key: np.concatenate([part[key] for part in of_each_process]) for key in episodes}
+    return batch, all_episodes
+
+
+def gae(rewards, values, alive, gamma, gae_lambda):
+    """A_t = sum_l (gamma lambda)^l delta_{t+l} and the returns A + V, all (T, N); V is 0 beyond an episode's end."""
+    device = rewards.device
+    rewards, values, alive = rewards.cpu(), values.cpu(), alive.cpu()  # a GPU would take longer: T small steps
+    advantages = torch.zeros_like(rewards)
+    lastgaelam = next_value = torch.zeros_like(values[0])
+    for t in reversed(range(len(rewards))):
+        delta = rewards[t] + gamma * next_value - values[t]
+        lastgaelam = (delta + gamma * gae_lambda * lastgaelam) * alive[t]
+        advantages[t] = lastgaelam
+        next_value = values[t] * alive[t]  # 0 beyond the episode's end
+    return advantages.to(device), (advantages + values).to(device)
+
+
+def moments(x, alive, dim):
+    """Mean and variance along dim of the living steps of every process."""
+    count = all_reduce_sum(alive.sum(dim, keepdim=True)).clamp(min=1)
+    mean = all_reduce_sum((x * alive).sum(dim, keepdim=True)) / count
+    variance = all_reduce_sum(((x - mean) ** 2 * alive).sum(dim, keepdim=True)) / count
+    return mean, variance
+
+
+def explained_variance(prediction, returns, alive):
+    """1 - Var(returns - prediction) / Var(returns) over the living steps, as CleanRL's."""
+    _, left = moments(returns - prediction, alive, (0, 1))
+    _, all_of_it = moments(returns, alive, (0, 1))
+    return (1 - left / all_of_it).item()
+
+
+def ppo_loss(agent, batch, mb, clip_coef, vf_coef, ent_coef):
+    """-L_CLIP + c1 L_VF - c2 H over the living steps of the episodes `mb`; returns it and what is logged.
+
+    The paper's sum with the sign that raises L_CLIP, and L_VF = 1/2 (critic - target)^2. Under torchrun the loss is
+    this process's part of the mean (the gradients are then summed), what is logged is of all.
+    """
+    alive = batch.alive[:, mb]
+    advantages = batch.advantages[:, mb]
+    steps = all_reduce_sum(alive.sum())
+
+    def mean(x):
+        return (x * alive).sum() / steps
+
+    hidden = agent.encode(batch.obs[:, mb].transpose(0, 1), batch.memory[:, mb]).transpose(0, 1)  # line 17
+    newlogprob, entropy, newvalue = agent.evaluate_actions(hidden, batch.actions[:, mb])
+    logratio = (newlogprob - batch.logprobs[:, mb]) * alive  # beyond an episode's end it could overflow
+    ratio = logratio.exp()
+
+    # policy loss, -L_CLIP
+    clipped = torch.clamp(ratio, 1 - clip_coef, 1 + clip_coef)
+    pg_loss = mean(torch.max(-advantages * ratio, -advantages * clipped))
+
+    # value loss, L_VF
+    v_loss = mean(0.5 * (newvalue - batch.targets[:, mb]) ** 2)
+
+    entropy_loss = mean(entropy)
+    loss = pg_loss - ent_coef * entropy_loss + vf_coef * v_loss
+
+    losses = {"policy_loss": pg_loss, "value_loss": v_loss, "entropy": entropy_loss, "total_loss": loss}
+    with torch.no_grad():  # http://joschu.net/blog/kl-approx.html
+        losses["old_approx_kl"] = mean(-logratio)
+        losses["approx_kl"] = mean((ratio - 1) - logratio)
+        losses["clipfrac"] = mean(((ratio - 1.0).abs() > clip_coef).to(ratio.dtype))
+    of_all_processes = all_reduce_sum(torch.stack([value.detach() for value in losses.values()]))
+    return loss, dict(zip(losses, of_all_processes))
+
+
+def ppo_gradient(args, agent, batch, mb, ent_coef):
+    """Set the parameters' `.grad` to the gradient of `ppo_loss`, clipped; returns what is logged, with its norm."""
+    loss, losses = ppo_loss(agent, batch, mb, args.clip_coef, args.vf_coef, ent_coef)
+    agent.zero_grad()
+    loss.backward()
+    runs.sum_gradients(agent)  # over torchrun's processes
+    losses["gradient_norm"] = nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
+    return losses
+
+
+# Shared, ours: what we add to PPO -------------------------------------------------------------------------------------
+def value_at(schedule, progress):
+    """The value of "0:-1 0.4:-2 1:-6" at `progress`, 0 in the first update and 1 in the last; a number is constant.
+
+    Linear between the points; of two points at one place the second counts from there on.
+    """
+    if not isinstance(schedule, str):
+        return schedule
+    points = [point.split(":") for point in schedule.split()]
+    places = [float(place) for place, _ in points]
+    values = [float(value) for _, value in points]
+    return float(np.interp(progress, places, values))
+
+
+def set_log_std(agent, args, progress):
+    """Set the log-std of this update if --log-std is a schedule; clamp it if it is learned.
+
+    Beyond LOG_STD_RANGE the clamp in `get_policy` has no gradient, so a learned log-std would never come back.
+    """
+    if agent.actor_logstd.requires_grad:
+        agent.actor_logstd.data.clamp_(*LOG_STD_RANGE)
+    else:
+        agent.actor_logstd.data.fill_(value_at(args.log_std, progress))
+
+
+def learning_rate_of(agent, args, progress):
+    """The learning rate of this update; with --lr-times-std it is multiplied by the policy's standard deviation.
+
+    Two policies whose means differ by delta have the KL divergence delta^2 / (2 std^2). A step of Adam moves each
+    weight by about the learning rate, so it moves the mean by an amount in proportion to the learning rate. If the
+    learning rate is in proportion to the std, a step changes the policy by about the same KL at any noise, and the
+    policy still learns when the noise is small.
+    """
+    learning_rate = value_at(args.learning_rate, progress)
+    if not args.lr_times_std:
+        return learning_rate
+    return learning_rate * agent.actor_logstd.exp().mean().item()
+
+
+def linear_fit(x, y, alive):
+    """The value that a linear regression predicts for y (..., G) from x (..., G, k), over a group's G episodes.
+
+    Only living episodes count. The regression has a small ridge penalty. An episode's own return is part of its fit.
+    So its residual is smaller by the factor 1 - leverage, and an episode in an extreme state counts less. The leverage
+    depends on the states of this step and not on the action. So with --gae-lambda 1 the expected policy gradient of a
+    state keeps its direction; below 1 this holds only approximately. Fits that leave the episode out were worse:
+    docs/training-notes.md.
+    """
+    x, y = x.double(), y.double()[..., None]
+    weight = alive.double()[..., None]  # (..., G, 1)
+    count = weight.sum(-2, keepdim=True).clamp(min=1)  # (..., 1, 1)
+    y_mean = (y * weight).sum(-2, keepdim=True) / count
+    x = (x - (x * weight).sum(-2, keepdim=True) / count) * weight  # centred
+    x = x / ((x * x).sum(-2, keepdim=True) / count).sqrt().add(1e-6)  # of unit spread
+    # a column that is equal in all episodes (the time) is zero here; the ridge keeps the matrix invertible
+    ridge = 0.01 * count * torch.eye(x.shape[-1]).to(x)
+    slope = torch.linalg.solve(x.mT @ x + ridge, x.mT @ (y - y_mean))
+    fitted = y_mean + x @ slope  # (..., G, 1)
+    return fitted[..., 0].to(alive.dtype)
+
+
+def returns_baseline(batch, gamma, group):
+    """The baseline (T, N) and the scale (T, 1) of the value V(s_t) = baseline_t + scale_t * critic(s_t).
+
+    The paper has V = critic: baseline 0, scale 1. So it is here with group 1. With small noise the critic's error is
+    larger than the effect of an action. Flights of one start, compared with one another, still show that effect.
+
+    Each `group` of neighbouring episodes flew the same start. Their returns from step t on are regressed linearly on
+    their observations at step t; the fit is the baseline. What it leaves over has a spread at each step, taken over
+    all flights of all groups. scale^2 is the spread^2 of the step plus (0.3 x the mean spread of the steps)^2: without
+    the second term a step of almost no spread would be divided by almost 0.
+
+    RLOO (Kool et al. 2019) takes the mean return of other samples of the same question as the baseline; GRPO (Shao et
+    al. 2024) takes that of the whole group, and divides by its spread. They have one return for each sample. Here each
+    step has one, hence the regression on the state, a linear control variate.
+    """
+    if group == 1:
+        return torch.zeros_like(batch.rewards), torch.ones_like(batch.rewards[:, :1])
+    no_values = torch.zeros_like(batch.critic)
+    monte_carlo, _ = gae(batch.rewards, no_values, batch.alive, gamma, 1.0)
+    obs = batch.obs.unflatten(1, (-1, group))
+    grouped_returns = monte_carlo.unflatten(1, (-1, group))
+    alive = batch.alive.unflatten(1, (-1, group))
+    baseline = linear_fit(obs, grouped_returns, alive).flatten(1)
+    _, variance = moments(monte_carlo - baseline, batch.alive, 1)
+    mean_spread = variance.sqrt().mean()  # steps that no flight reaches count as zeros
+    return baseline, (variance + (0.3 * mean_spread) ** 2 + 1e-8).sqrt()
+
+
+# Shared: training (Algorithm 1) and main ------------------------------------------------------------------------------
+def minibatches(args, envs, device):
+    """(epoch, minibatch, episodes) of lines 15 and 16: in each epoch every episode once, in a new order."""
+    for epoch in range(1, args.update_epochs + 1):
+        order = torch.randperm(envs.num_envs, device=device)
+        for minibatch, mb in enumerate(order.tensor_split(args.num_minibatches), start=1):
+            yield epoch, minibatch, mb
+
+
+def train(args, agent, average, optimizer, envs, run, gradient=ppo_gradient):
+    """Algorithm 1, its lines beside ours. `run` counts, logs, saves and evaluates; it changes nothing that is learned.
+
+    Raises FloatingPointError, before the optimiser moves the weights, when a loss or the gradient is not finite.
+    """
+    target_kl = math.inf if args.target_kl is None else args.target_kl
+    for iteration in range(run.updates_done + 1, args.total_updates + 1):  # line 2
+        progress = (iteration - 1) / max(args.total_updates - 1, 1)
+        memory_noise = value_at(args.memory_noise, progress)
+        gae_lambda = value_at(args.gae_lambda, progress)
+        ent_coef = value_at(args.ent_coef, progress)
+        set_log_std(agent, args, progress)
+        learning_rate = learning_rate_of(agent, args, progress)
+        optimizer.param_groups[0]["lr"] = learning_rate
+        group = set_curriculum(envs, args, progress)  # ours
+
+        # lines 3-13: fly one episode in every environment
+        batch, episodes = rollout(agent, envs, args.reward_scale, memory_noise)
+        add_rewards(envs, args, progress, batch, episodes)  # ours
+
+        # line 14: returns and advantages
+        baseline, scale = returns_baseline(batch, args.gamma, group)  # ours; 0 and 1 with group 1
+        values = baseline + scale * batch.critic
+        advantages, returns = gae(batch.rewards, values, batch.alive, args.gamma, gae_lambda)
+        batch.targets = (returns - baseline) / scale
+        batch.advantages = advantages
+        if args.norm_adv:
+            mean, variance = moments(advantages, batch.alive, (0, 1))
+            batch.advantages = (advantages - mean) / (variance.sqrt() + 1e-8)
+
+        # lines 15-18: epochs of minibatches
+        log = []
+        for epoch, minibatch, mb in minibatches(args, envs, advantages.device):  # lines 15 and 16
+            losses = gradient(args, agent, batch, mb, ent_coef)  # lines 17 and 18
+            losses = runs.finite(losses, epoch, minibatch)
+            log.append(losses)
+            if losses["approx_kl"] > target_kl:
+                break  # this minibatch takes no step, and ends the update
+            optimizer.step()  # line 18
+            average.update_parameters(agent)  # ours: what evaluation flies
+
+        means = {name: torch.tensor([logged[name] for logged in log]).mean().item() for name in losses}
+        means["explained_variance"] = explained_variance(batch.critic, batch.targets, batch.alive)
+        means["baseline_explained_variance"] = explained_variance(baseline, returns, batch.alive)
+
+        run.end_update(iteration, batch.alive, episodes, means, learning_rate)
+
+
+def main(argv):
+    args, saved = runs.parse_args(Args, recipe, argv, ENV_OPTIONS, BUFFERS)
+    device = runs.prepare_torch(args)
+    env_options = {name: getattr(args, name) for name in ENV_OPTIONS} | FIXED_OPTIONS
+    envs = runs.make_envs(args, env_options)
+    agent = Agent(args, envs).to(device)
+    runs.load_checkpoint(agent, args, saved)
+    before_training(agent, args, env_options)
+    average = AveragedModel(agent, multi_avg_fn=get_ema_multi_avg_fn(args.weight_average))
+    optimizer = torch.optim.Adam(agent.parameters(), eps=1e-5, fused=True)  # train sets its learning rate
+    run = runs.Run(
+        args=args,
+        saved=saved,
+        agent=agent,
+        average=average,
+        optimizer=optimizer,
+        envs=envs,
+        env_options=env_options,
+        describe=describe,
+    )
+    gradient = speed_up(agent, average, optimizer, ppo_gradient) if args.torch_compile else ppo_gradient
+    if not args.eval_only:
+        with run:  # whatever ends the training leaves its state after the last whole update
+            train(args, agent, average, optimizer, envs, run, gradient)
+    run.finish()
+
+
+if __name__ == "__main__":
+    runs.start(main)

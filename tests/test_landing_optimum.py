@@ -1,0 +1,185 @@
+"""The landers' fuel optima: against published numbers, SciPy's integrator and the environment."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from common.errors import BadInput, NoOptimum
+from envs import MARS, POWERED_DESCENT, fly_lander
+from landing import optimum
+from landing.lander import DRAW, flights
+from landing.optimum import optimise_landing, references
+
+pytestmark = pytest.mark.slow
+
+LANDING, DESCENT = "MarsLanding-v0", "PoweredDescent-v0"
+RANDOM = {"failure_probability": 0.7, "failure_time": "random"}
+
+
+def rows(n, seed=0):
+    """Draws (n, 13)."""
+    return np.random.default_rng(seed).random((n, len(DRAW)))
+
+
+def played(u):
+    """The policy that plays commands u (n, T, 3) in N of the Mars lander."""
+    actions = np.nan_to_num(u) / MARS.greatest_thrust
+    return lambda obs, t: actions[:, min(t, actions.shape[1] - 1)]
+
+
+# --- Acikmese and Ploen's lander --------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def descent():
+    """Its one flight, solved by glide slope."""
+    flight = flights(POWERED_DESCENT, np.full((1, len(DRAW)), 0.5), 0.0, 2.5, "start")
+    return {slope: optimise_landing(POWERED_DESCENT, flight, 0, slope) for slope in (None, 0.0, 4.0)}
+
+
+@pytest.mark.parametrize(
+    "slope, fuel, seconds",
+    [(None, 387.9, 72.2), (0.0, 390.4, 74.3), (4.0, 398.1, 77.7)],
+    ids=["no path constraint", "above ground", "glide slope of 4 degrees"],
+)
+def test_powered_descent_is_that_of_other_solves(descent, slope, fuel, seconds):
+    assert descent[slope]["fuel_kg"] == pytest.approx(fuel, rel=3e-4)
+    assert descent[slope]["final_time"] == pytest.approx(seconds, abs=0.3)
+
+
+def test_paths_keep_their_constraints(descent):
+    assert descent[None]["y"][:, 2].min() < -100  # else the other two would say nothing
+    assert descent[0.0]["y"][:-1, 2].min() >= 0
+    r = descent[4.0]["y"][:-1, :3]
+    assert (r[:, 2] >= np.tan(np.radians(4)) * np.hypot(r[:, 0], r[:, 1]) - 1e-3).all()
+    for found in descent.values():
+        norm = np.linalg.norm(found["u"], axis=1)
+        assert norm.min() >= POWERED_DESCENT.least_thrust * (1 - 1e-6)
+        assert norm.max() <= POWERED_DESCENT.greatest_thrust * (1 + 1e-6)
+        assert found["y"][:, 6].min() >= POWERED_DESCENT.dry_mass
+        assert len(found["t"]) == len(found["y"]) == len(found["u"]) + 1
+
+
+def test_equal_flights_are_solved_once(monkeypatch):
+    """Nothing of this lander is drawn."""
+    calls = []
+
+    def counted(lander, flights, k):
+        calls.append(k)
+        return optimise_landing(lander, flights, k)
+
+    monkeypatch.setattr(optimum, "optimise_landing", counted)
+    found = references(DESCENT, rows(3, seed=9))
+    assert len(calls) == 1
+    assert np.ptp(found["fuel_kg"]) == 0
+
+
+# --- Mars -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def mars():
+    """Draws (10, 13) and their references, with failures at random moments."""
+    draw = rows(10)
+    return draw, references(LANDING, draw, **RANDOM)
+
+
+def test_every_reference_lands_as_it_was_solved(mars):
+    draw, found = mars
+    flown = fly_lander(LANDING, played(found["u"]), draw, **RANDOM)
+    assert found["solved"].all() and flown["down"].all()
+    assert flown["position_error"].max() < 0.01
+    assert flown["speed"].max() < 0.02
+    np.testing.assert_allclose(flown["fuel_kg"], found["fuel_kg"], atol=1e-6)
+    np.testing.assert_allclose(flown["final_time"], found["final_time"], atol=1e-6)
+    np.testing.assert_allclose(flown["u"], found["u"], atol=1e-2)  # nothing is clipped
+
+
+def test_arrays_are_nan_behind_the_last_period_alone(mars):
+    _, found = mars
+    periods = np.ceil(found["final_time"] / optimum.PERIOD - 1e-6).astype(int)
+    for k, count in enumerate(periods):
+        assert np.isfinite(found["u"][k, :count]).all() and np.isnan(found["u"][k, count:]).all()
+        assert np.isfinite(found["y"][k, : count + 1]).all() and np.isnan(found["y"][k, count + 1 :]).all()
+    assert np.isfinite(found["fuel_kg"]).all() and np.isfinite(found["final_time"]).all()
+
+
+def test_commands_lead_there_by_scipys_integrator(mars):
+    """DOP853 with its own reading of the draw, of the failure and of the engine."""
+    draw, found = mars
+    struck = (draw[:, 10] < 0.7) & (40 * draw[:, 12] < found["final_time"])
+    k = int(np.flatnonzero(struck)[0])
+    z, end = 2 * draw[k] - 1, found["final_time"][k]
+    g = 3.7114 * 0.05 * z[7:10] - [0, 0, 3.7114]
+    y = np.concatenate([[1000, 0, 2350] + [1000, 1000, 50] * z[:3], [-40, 0, -80] + [30, 30, 10] * z[3:6]])
+    y = np.append(y, 2000 * (1 + 0.05 * z[6]))
+    start = y.copy()
+    loss = np.array([2.5, 1, 1.5]) if draw[k, 11] < 0.5 else np.array([1, 2.5, 1.5])
+    for period, begin in enumerate(np.arange(0, end, 0.2)):
+        u = found["u"][k, period]
+        thrust = u / loss if begin >= 40 * draw[k, 12] else u
+        assert 4000 * (1 - 1e-6) <= np.linalg.norm(thrust) and np.linalg.norm(u) <= 24000 * (1 + 1e-6)
+        flow = np.linalg.norm(thrust) / (210 * 9.81)
+        rate = lambda t, y, T=thrust, q=flow: np.concatenate([y[3:6], T / y[6] + g, [-q]])  # noqa: E731
+        span = begin, min(begin + 0.2, end)
+        y = solve_ivp(rate, span, y, method="DOP853", rtol=1e-12, atol=1e-9).y[:, -1]
+    assert np.linalg.norm(y[:3]) < 1e-4
+    assert np.linalg.norm(y[3:6]) < 0.02
+    assert start[6] - y[6] == pytest.approx(found["fuel_kg"][k], abs=1e-5)
+
+
+def test_knowing_when_a_failure_strikes(mars):
+    """The later, the less propellant; behind the touchdown it does not matter. A failure from the start costs most."""
+    draw = np.repeat(rows(1, seed=3), 4, axis=0)
+    draw[:, 10], draw[:, 12] = 0.0, [0.0, 0.3, 0.6, 1.0]
+    by_moment = references(LANDING, draw, **RANDOM)["fuel_kg"]
+    healthy = references(LANDING, draw[:1], failure_probability=0.0)["fuel_kg"][0]
+    assert (np.diff(by_moment) < 0).all()
+    assert by_moment[3] == pytest.approx(healthy, abs=1e-6)
+    at_start = references(LANDING, draw[:1], failure_probability=1.0)["fuel_kg"][0]
+    assert at_start == pytest.approx(by_moment[0], abs=1e-6)
+
+
+def test_the_guess_does_not_matter(monkeypatch):
+    drawn = flights(MARS, rows(3, seed=5), 0.7, 2.5, "random")
+    found = []
+    for share in (0.8, 1.3):
+        monkeypatch.setattr(optimum, "DURATIONS", (share,))
+        found.append([optimise_landing(MARS, drawn, k)["fuel_kg"] for k in range(3)])
+    np.testing.assert_allclose(*found, atol=1e-3)
+
+
+def test_references_are_remembered_and_cannot_be_written_to(mars):
+    draw, found = mars
+    again = references(LANDING, draw.copy(), **RANDOM, observe_draw=True)
+    assert again["u"] is found["u"]
+    with pytest.raises(ValueError, match="read-only"):
+        found["fuel_kg"][0] = 0.0
+
+
+def test_processes_change_only_the_time(mars):
+    draw, found = mars
+    shared = references(LANDING, draw[:2], processes=2, **RANDOM)
+    np.testing.assert_allclose(shared["fuel_kg"], found["fuel_kg"][:2], rtol=1e-9)
+
+
+def test_an_optimum_that_is_not_there_is_one_line():
+    weak = replace(MARS, greatest_thrust=7000.0)  # 3.5 m/s^2
+    with pytest.raises(NoOptimum, match="^landing: IPOPT stopped with [^\n]*$"):
+        optimise_landing(weak, flights(weak, rows(1), 0.0, 2.5, "start"), 0)
+    brief = replace(MARS, longest=10.0)
+    with pytest.raises(NoOptimum, match="^landing: it takes [^\n]* longer than a flight, 10 s$"):
+        optimise_landing(brief, flights(brief, rows(1), 0.0, 2.5, "start"), 0)
+
+
+def test_a_solution_that_does_not_land_is_refused(monkeypatch):
+    monkeypatch.setattr(optimum, "TOUCHDOWN", np.array([0.0, 0.0, -1e-7, 0.0, 0.0, -0.5]))
+    with pytest.raises(NoOptimum, match="^landing: the replay of a solution of [^\n]* m from the pad with 0.5 m/s$"):
+        optimise_landing(MARS, flights(MARS, rows(1), 0.0, 2.5, "start"), 0)
+
+
+def test_an_unknown_option_is_refused():
+    with pytest.raises(BadInput, match="failure_moment"):
+        references(LANDING, rows(1), failure_moment="random")

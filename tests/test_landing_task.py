@@ -1,0 +1,123 @@
+"""What is asked of a lander's id: metrics by hand, the optimum beside a policy, the script from training to files."""
+
+import importlib
+import json
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import envs
+import evaluate
+from common.evaluations import read_evaluation
+from common.tasks import task_of
+from landing.environment import fly_lander
+from landing.metrics import draws, flight_metrics, fly_draws
+from landing.task import held
+
+ID = "MarsLanding-v0"
+script = importlib.import_module("ppo_gtrxl_lander")
+
+
+def falls(obs, t):
+    """A policy that asks for nothing: the least thrust, straight up."""
+    return np.zeros((len(obs), 3))
+
+
+def test_draws_are_those_of_the_seed_and_not_of_their_number():
+    assert np.array_equal(draws(4, 50)[:20], draws(4, 20))
+    assert not np.array_equal(draws(5, 20), draws(4, 20))
+    assert draws(0, 1000).min() >= 0 and draws(0, 1000).max() <= 1
+
+
+def test_metrics_by_hand():
+    flown = {
+        "episodic_return": np.array([-1.0, -3.0]),
+        "position_error": np.array([0.0, 4.0]),
+        "speed": np.array([1.0, 1.5]),
+        "slope": np.array([9.0, 3.0]),
+        "down": np.array([True, True]),
+        "landed": np.array([True, False]),
+        "fuel_kg": np.array([200.0, 210.0]),
+        "final_time": np.array([40.0, 50.0]),
+    }
+    metrics = flight_metrics(flown)
+    assert metrics["landed_rate"] == 0.5 and metrics["soft_rate"] == 1.0
+    assert metrics["position_error_mean_m"] == 2.0 and metrics["position_error_max_m"] == 4.0
+    assert metrics["speed_std_m_s"] == 0.25 and metrics["fuel_mean_kg"] == 205.0
+
+
+def test_batches_do_not_change_a_flight():
+    """1500 flights in two batches are the flights of one batch."""
+    z = draws(1, 1500)
+    parts = fly_draws(ID, lambda some: falls, z)
+    whole = fly_lander(ID, falls, z)
+    assert np.array_equal(parts["final_y"], whole["final_y"])
+    assert np.array_equal(parts["u"], whole["u"], equal_nan=True)
+    assert parts["y"].shape[0] == 100
+
+
+def test_recorded_flights_can_be_flown_again():
+    """u, effectiveness, start and gravity alone: integrated by hand they end where final_y says."""
+    z = draws(2, 4)
+    commands = lambda obs, t: np.tile([0.05, -0.02, 0.45], (4, 1))  # noqa: E731
+    flown = fly_lander(ID, commands, z, failure_time="random", failure_probability=1.0)
+    for k in range(4):
+        r, v, m = np.split(flown["start"][k].copy(), [3, 6])
+        acts = np.isfinite(flown["u"][k, :, 0])
+        left = flown["final_time"][k]
+        for u, effectiveness in zip(flown["u"][k, acts], flown["effectiveness"][k, acts]):
+            thrust = u * effectiveness
+            thrust *= np.clip(np.linalg.norm(thrust), 4000, 24000) / np.linalg.norm(thrust)
+            h = min(left, 0.2) / 200
+            left -= 0.2
+            for _ in range(200):  # the midpoint rule
+                flow = np.linalg.norm(thrust) / (210 * 9.81)
+                a = thrust / (m - flow * h / 2) + flown["gravity"][k]
+                r, v, m = r + v * h + a * h * h / 2, v + a * h, m - flow * h
+        assert np.concatenate([r, v, m]) == pytest.approx(flown["final_y"][k], abs=1e-4)
+
+
+def test_the_optimum_lands_on_less_than_any_policy():
+    task = task_of(ID)
+    reference = task.optimum(3, 4)
+    assert reference["solved"].all() and reference["down"].all()
+    assert reference["position_error"].max() < 0.01 and reference["speed"].max() < 0.02
+    metrics, arrays = task.evaluate(falls, 3, 10, task.optimum(3, 10))
+    assert metrics["landed_rate"] == 0 and metrics["reference_starts"] == 10
+    assert all(np.isfinite(value) for value in metrics.values() if not isinstance(value, str))
+    assert task.table(metrics).count("\n") > 10
+    assert task.required_arrays(metrics) <= arrays.keys()
+    again = fly_lander(ID, held(arrays["u"], envs.MARS), draws(3, 10))
+    assert again["final_y"] == pytest.approx(arrays["final_y"])
+
+
+def test_the_script_trains_evaluates_and_publishes(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    argv = ["--total-updates=2", "--num-envs=4", "--eval-every=0", "--eval-starts=10", "--failure-time=random"]
+    script.main(argv)
+    (run,) = (tmp_path / "runs").iterdir()
+    metrics, arrays = read_evaluation(run)
+    assert metrics["failure_time"] == "random" and metrics["decision_s"] == 1.0
+    assert arrays["u"].shape[::2] == (10, 3) and float(arrays["decision_s"]) == 0.2
+    script.main(
+        [f"--checkpoint={run / 'agent.safetensors'}", "--eval-only", "--eval-starts=10", "--eval-json=again.json"]
+    )
+    again = json.loads((tmp_path / "again.json").read_text())
+    assert again["position_error_mean_m"] == metrics["position_error_mean_m"]
+    flags = ["--eval-only", "--eval-starts=10", "--eval-json=start.json", "--failure-time=start"]
+    script.main([f"--checkpoint={run / 'agent.safetensors'}", *flags])
+    assert json.loads((tmp_path / "start.json").read_text())["failure_time"] == "start"
+    evaluate.publish(run, tmp_path / "results", ship=False)
+    assert (tmp_path / "results" / "eval.npz").is_file()
+    capsys.readouterr()
+
+
+def test_training_meets_failures_of_another_size():
+    """As published: of size 2 in training, of 2.5 in evaluations."""
+    args = script.Args(**script.OURS)
+    batch = gym.make_vec(ID, num_envs=args.num_envs)
+    script.set_curriculum(batch, args, 0.0)
+    batch.reset(seed=0)
+    assert batch.flights.failed.min() == 0.5
+    assert gym.make_vec(ID, num_envs=1).failure_size == 2.5
