@@ -12,8 +12,6 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -22,8 +20,9 @@ from pathlib import Path
 import numpy as np
 
 from common.checkpoints import read_checkpoint
-from common.errors import BadInput, refuse_unless
+from common.errors import refuse_unless
 from common.files import write_json
+from common.policies import evaluate_by_script
 from landing.environment import fly_lander
 from landing.guidance import LAWS, Replanned, drdv, drdv_estimated
 from landing.lander import LANDERS, Lander, flights
@@ -56,14 +55,9 @@ def fly_checkpoint(path, failure: dict, eval_seed: int, n: int) -> dict:
     """What the policy's script finds on the first n draws of a seed. BadInput with the script's own line."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "eval.json"
-        flags = {"checkpoint": path, "eval-starts": n, "eval-seed": eval_seed, "eval-json": file, "num-threads": 1}
+        flags = {"eval-starts": n, "eval-seed": eval_seed, "eval-json": file, "num-threads": 1}
         flags |= {name.replace("_", "-"): value for name, value in failure.items()}
-        command = [sys.executable, str(POLICY_SCRIPT), "--eval-only", "--no-cuda"]
-        command += [f"--{name}={value}" for name, value in flags.items()]
-        done = subprocess.run(command, capture_output=True, text=True)
-        if done.returncode:
-            said = done.stderr.strip().splitlines() or [f"{POLICY_SCRIPT.name} ended with {done.returncode}"]
-            raise BadInput(f"{path}: {said[-1]}")
+        evaluate_by_script(POLICY_SCRIPT, path, flags)
         metrics = json.loads(file.read_text())
     kept = {key: value for key, value in metrics.items() if isinstance(value, int | float)}
     return kept | {"knows": "flights in training"}

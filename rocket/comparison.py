@@ -11,8 +11,6 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
-import sys
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -20,8 +18,9 @@ from pathlib import Path
 import numpy as np
 
 from common.checkpoints import read_checkpoint
-from common.errors import BadInput, refuse_unless
+from common.errors import refuse_unless
 from common.files import write_json
+from common.policies import evaluate_by_script
 from rocket import guidance
 from rocket.dispersion import draw_vehicles
 from rocket.metrics import (
@@ -67,14 +66,9 @@ def fly_checkpoint(path, dispersion: float, eval_seed: int, n: int):
     args = read_checkpoint(path, {}, flag="")["args"]
     with tempfile.TemporaryDirectory() as folder:
         files = [Path(folder) / name for name in ("eval.json", "eval.npz")]
-        flags = {"checkpoint": path, "dispersion": dispersion, "eval-starts": n, "eval-seed": eval_seed}
+        flags = {"dispersion": dispersion, "eval-starts": n, "eval-seed": eval_seed}
         flags |= {"eval-json": files[0], "eval-npz": files[1], "num-threads": 1}
-        command = [sys.executable, str(POLICY_SCRIPT), "--eval-only", "--no-cuda"]
-        command += [f"--{name}={value}" for name, value in flags.items()]
-        done = subprocess.run(command, capture_output=True, text=True)
-        if done.returncode:
-            said = done.stderr.strip().splitlines() or [f"{POLICY_SCRIPT.name} ended with {done.returncode}"]
-            raise BadInput(f"{path}: {said[-1]}")
+        evaluate_by_script(POLICY_SCRIPT, path, flags)
         decision_us = json.loads(files[0].read_text())["decision_us"]
         with np.load(files[1]) as file:
             arrays = {key: file[key] for key in ("draw", "final_y", "final_t", "final_error")}
