@@ -1,9 +1,9 @@
 """PPO with a Gated Transformer-XL on a landing with a hidden engine failure, measured against the true optimum.
 
-    python ppo_gtrxl_lander.py --seed 1                                # by our recipe, as results/mars_landing
+    python ppo_gtrxl_lander.py --seed 1                                # by our recipe
     python ppo_gtrxl_lander.py --seed 1 --failure-time random          # the failure strikes within the first 40 s
     python ppo_gtrxl_lander.py --seed 1 --env-id PoweredDescent-v0     # nothing is hidden
-    python ppo_gtrxl_lander.py --eval-only --checkpoint results/mars_landing/agent.safetensors
+    python ppo_gtrxl_lander.py --eval-only --checkpoint runs/<run>/agent.safetensors
 
 Top to bottom: arguments, recipes, problem, Gated Transformer-XL, agent, PPO, what we add to it, training, main.
 From the first "Shared" on, all ppo_gtrxl_*.py are the same to the letter. A section with "ours" in its heading has
@@ -57,7 +57,7 @@ class Args:
     checkpoint: str | None = None  # start from these weights (.safetensors)
     resume: str | None = None  # run folder of an interrupted run to go on with, bit for bit
     eval_only: bool = False  # fly the mean action of --checkpoint, train nothing, write only --eval-json and --eval-npz
-    eval_starts: int | None = None  # drawn flights of the evaluation (default 10000; 100 in a training cut short)
+    eval_starts: int | None = None  # drawn flights of the evaluation (default 10000; 10 in a training cut short)
     eval_seed: int = 0  # seed of the evaluation starts
     eval_json: str | None = None  # where --eval-only writes the metrics
     eval_npz: str | None = None  # where --eval-only writes the trajectories
@@ -134,7 +134,7 @@ OURS = {
     "fuel_weight": 4.0,
     "slope_weight": "0:0 0.3:0 0.6:3",  # not before the pad is reached: a steep crash is a crash
     "weight_average": 0.998,
-    "decision_s": 1.0,  # with 0.2 an episode has five times the steps, and noise that is new in each moves less
+    "decision_s": 1.0,  # an episode has a fifth of the steps that it has with 0.2
 }
 MARS = {**OURS, "longest_flight": 60.0}  # flights of learned policies take 45 s
 ONE_START = {  # all flights of an update are compared
@@ -170,8 +170,9 @@ def features(agent, obs):
 
     - position, velocity, time, the last command, the draw with --observe-draw
     - position and velocity by asinh, in which small ones show
-    - the time t = 2 h / (1 m/s - vz) in which an even braking ends at height 0, and what an even acceleration has to
-      be, over gravity's: of vertical speed vz^2 / (2 h), of lateral position r / t^2 and velocity v / t
+    - about the time t = 2 h / -vz in which an even braking ends at height 0 (in the code with 1 m/s and 0.5 s more, so
+      that nothing is divided by 0), and accelerations over gravity's, by asinh: the even braking vz^2 / (2 h), and
+      r / t^2 and v / t of the lateral position and velocity
     """
     r, v, time, command, draw = obs.split([3, 3, 1, 3, obs.shape[-1] - OBSERVED], dim=-1)
     height, fall = r[..., 2:].clamp(min=0.0), (-v[..., 2:]).clamp(min=0.0)
@@ -204,7 +205,7 @@ def describe(episodes, metrics):
 
 # Problem, ours: what only training changes ----------------------------------------------------------------------------
 ALOFT_PRICE = 20.0  # hovering above the pad must cost more than any miss
-SINK_RATE = 0.3  # m/s; a policy that aims at rest on the ground comes to rest above it, half the time
+SINK_RATE = 0.3  # m/s; a policy that aims at rest on the ground can come to rest just above it, and hover
 
 
 def set_curriculum(envs, args, progress):

@@ -1,6 +1,6 @@
 """A landing policy against its opponents, all on the same draws: one table, opponents.json.
 
-    python evaluate.py opponents results/mars_landing
+    python evaluate.py opponents runs/<run>
 
 `guidance.py` has the opponents; here they are flown, measured as a policy is, and printed, beside the rows that the
 published code's notebooks print. Policies are flown by their script in processes of its own: nothing imports a script,

@@ -1,4 +1,4 @@
-"""A landing's printed table, "limit | optimum | ours"."""
+"""A landing's printed table, "optimum | ours"."""
 
 from __future__ import annotations
 
