@@ -144,8 +144,8 @@ class CapturedGradient:
         self.gradients = None
 
     def __call__(self, args, agent, batch, mb, ent_coef):
-        if self.batch is None:
-            self.batch = dataclasses.replace(batch)
+        if self.batch is None or self.batch.obs.shape != batch.obs.shape:  # episodes may get another length
+            self.batch, self.graphs = dataclasses.replace(batch), {}
             self.ent_coef = torch.zeros((), device=mb.device)
         elif batch is not self.copied:
             for field in dataclasses.fields(batch):

@@ -50,8 +50,9 @@ class LanderVectorEnv(BatchedEnv):
     after the longest time, and stops a flight whose range grows by 500 m past its least.
 
     Reward: -`fuel_price` for 100 kg burnt in the step; at the end `terminal_reward`, and `slope_reward` or, in the air,
-    -`aloft_price`. The prices and scales are attributes that only training changes. So is `sink_rate` (m/s), the
-    vertical speed at touchdown that counts as none.
+    -`aloft_price`. The prices and scales are attributes that only training changes. So are `sink_rate` (m/s), the
+    vertical speed at touchdown that counts as none, and `thrust_share`, the share of the greatest thrust that a command
+    may ask for.
 
     `final_info`: `episodic_return` (with the prices and scales of `rewards.py`), `position_error` (m), `speed` (m/s),
     `slope`, `down`, `landed`, `fuel_kg`, `final_time` (s), each (N,), `final_y` (N, 7) and `draw` (N, 13).
@@ -87,21 +88,19 @@ class LanderVectorEnv(BatchedEnv):
         self.observe_command, self.observe_draw = observe_command, observe_draw
         self.observe_velocity, self.observe_phase = observe_velocity, observe_phase
         self.published_end = published_end
-        multiple = is_finite(decision_s) and decision_s > 0 and abs(decision_s / PERIOD % 1 - 0.5) > 0.5 - 1e-6
-        refuse_unless(multiple, "decision_s", repr(decision_s), f"must be a multiple of {PERIOD} s")
-        self._hold = round(decision_s / PERIOD)
         self.longest_flight = lander.longest if longest_flight is None else longest_flight
         possible = is_finite(self.longest_flight) and 0 < self.longest_flight <= lander.longest
         allowed = f"must be above 0 and at most the lander's, {lander.longest:g} s"
         refuse_unless(possible, "longest_flight", repr(longest_flight), allowed)
-        steps = math.ceil(self.longest_flight / self.dt - 1e-9) + published_end
+        self.decision_s = decision_s
         action = Box(-1.0, 1.0, (3,), dtype=np.float64)
-        super().__init__(num_envs, steps, self._observation_space(), action, render_mode, autoreset_mode)
+        super().__init__(num_envs, self.episode_steps, self._observation_space(), action, render_mode, autoreset_mode)
         self.observation_scale = np.array([1000.0] * 3 + [50.0] * 3 + [self.longest_flight] + [1.0] * 3)
         if observe_draw:
             self.observation_scale = np.append(self.observation_scale, np.ones(7))
         self.position_scale, self.speed_scale, self.sink_rate = POSITION_SCALE, SPEED_SCALE, 0.0
         self.fuel_price, self.aloft_price, self.slope_price = FUEL_PRICE, ALOFT_PRICE, SLOPE_PRICE
+        self.thrust_share = 1.0
         self.draw = np.zeros((num_envs, len(DRAW)))
         self.flights = self._drawn(self.draw)
         self.r, self.v, self.mass = self.flights.r.copy(), self.flights.v.copy(), self.flights.mass.copy()
@@ -117,6 +116,18 @@ class LanderVectorEnv(BatchedEnv):
     def dt(self) -> float:
         """Seconds between two decisions."""
         return self._hold * PERIOD
+
+    @property
+    def decision_s(self) -> float:
+        """The same; it may be set before a `reset`."""
+        return self.dt
+
+    @decision_s.setter
+    def decision_s(self, seconds: float):
+        is_multiple = is_finite(seconds) and seconds > 0 and abs(seconds / PERIOD % 1 - 0.5) > 0.5 - 1e-6
+        refuse_unless(is_multiple, "decision_s", repr(seconds), f"must be a multiple of {PERIOD} s")
+        self._hold = round(seconds / PERIOD)
+        self.episode_steps = math.ceil(self.longest_flight / self.dt - 1e-9) + self.published_end
 
     def _drawn(self, draw) -> Flights:
         return flights(self.lander, draw, self.failure_probability, self.failure_size, self.failure_time)
@@ -185,7 +196,7 @@ class LanderVectorEnv(BatchedEnv):
     def _advance(self, actions):
         burnt = self.mass.copy()
         greatest = self.lander.greatest_thrust
-        command = greatest * limited(actions.T, self.lander.least_thrust / greatest, 1.0)
+        command = greatest * limited(actions.T, self.lander.least_thrust / greatest, self.thrust_share)
         self.u[:] = command.T
         for _ in range(self._hold):
             self._fly(command)
@@ -315,6 +326,7 @@ class LanderEnv(SingleEnv):
     fuel_price = of_batch("fuel_price", "Reward lost for 100 kg of propellant.")
     aloft_price = of_batch("aloft_price", "Reward lost where a flight ends in the air.")
     slope_price = of_batch("slope_price", "Weight of `slope_reward`.")
+    thrust_share = of_batch("thrust_share", "Share of the greatest thrust that a command may ask for.")
 
 
 def make_lander_vector(env_id: str, num_envs: int = 1, **options) -> LanderVectorEnv:

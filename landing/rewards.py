@@ -13,11 +13,12 @@ SLOPE_HEIGHT = 2.0  # m
 # of the reported return; a training may set others
 POSITION_SCALE = 0.1  # m
 SPEED_SCALE = 0.1  # m/s
-FAR = 100.0  # m
-FAST = 10.0  # m/s
+FAR = 20.0  # m
+FAST = 5.0  # m/s
 FUEL_PRICE = 1.0  # for 100 kg
 ALOFT_PRICE = 10.0  # where a flight ends in the air
 SLOPE_PRICE = 2.0
+STEEP = 20.0  # a steeper slope pays no more
 FLATTEST = 0.05  # a flatter slope costs no more
 
 
@@ -27,15 +28,15 @@ def has_landed(position_error, speed, slope, is_down):
 
 
 def terminal_reward(position_error, speed, position_scale, speed_scale):
-    """-ln(1 + |r| / position_scale) - ln(1 + |v| / speed_scale) - |r| / 100 m - |v| / 10 m/s.
+    """-ln(1 + |r| / position_scale) - ln(1 + |v| / speed_scale) - |r| / 20 m - |v| / 5 m/s.
 
     Each halving of an error pays the same. Two logarithms and not one of a norm: the larger error does not hide the
-    smaller one. The linear terms outweigh the propellant that a crash at high speed saves.
+    smaller one. The linear terms outweigh the propellant that is saved by giving up a far pad, or the braking.
     """
     near = np.log1p(position_error / position_scale) + np.log1p(speed / speed_scale)
     return -near - position_error / FAR - speed / FAST
 
 
 def slope_reward(slope, price):
-    """-price (1 / slope - 1 / 7), not above 0: run over fall. It asks for a little more than the limit of 1 / 5."""
-    return -price * np.maximum(1 / np.maximum(slope, FLATTEST) - 1 / 7, 0.0)
+    """-price ln(20 / slope), not above 0: each doubling of a flat slope pays the same, well past the limit of 5."""
+    return -price * np.log(np.maximum(STEEP / np.maximum(slope, FLATTEST), 1.0))

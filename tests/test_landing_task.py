@@ -98,7 +98,7 @@ def test_the_script_trains_evaluates_and_publishes(tmp_path, monkeypatch, capsys
     script.main(argv)
     (run,) = (tmp_path / "runs").iterdir()
     metrics, arrays = read_evaluation(run)
-    assert metrics["failure_time"] == "random" and metrics["decision_s"] == 1.0
+    assert metrics["failure_time"] == "random" and metrics["decision_s"] == 0.4
     assert arrays["u"].shape[::2] == (10, 3) and float(arrays["decision_s"]) == 0.2
     script.main(
         [f"--checkpoint={run / 'agent.safetensors'}", "--eval-only", "--eval-starts=10", "--eval-json=again.json"]
