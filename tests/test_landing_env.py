@@ -10,7 +10,7 @@ from common.errors import BadInput
 from landing.dynamics import burn
 from landing.environment import PERIOD, fly_lander, limited
 from landing.lander import DRAW, MARS, POWERED_DESCENT, flights
-from landing.rewards import has_landed
+from landing.rewards import has_landed, slope_reward
 
 ID = "MarsLanding-v0"
 MIDDLE = np.full((1, len(DRAW)), 0.5)  # the nominal lander in the middle of its box, healthy: 0.5 is not below 0.5
@@ -189,6 +189,12 @@ def test_the_slope_is_that_of_the_last_two_metres():
     assert has_landed(0.1, 1.0, 5.1, True) and not has_landed(0.1, 1.0, 4.9, True)
 
 
+def test_the_slope_pays_by_doublings():
+    """Steeper than 20 : 1 pays nothing more; half as steep costs ln 2 of the price each time, down to 1 : 20."""
+    slope = np.array([1e9, 20.0, 10.0, 5.0, 0.05, 0.0])
+    assert slope_reward(slope, 2.0) == pytest.approx(-2 * np.log([1.0, 1.0, 2.0, 4.0, 400.0, 400.0]))
+
+
 # ---------------------------------------------------------------------------------------------------------------------
 # Decisions, observations, input
 # ---------------------------------------------------------------------------------------------------------------------
@@ -207,6 +213,33 @@ def test_a_longer_decision_is_a_repeated_command():
         others = [fast.advance(commands[t]) for _ in range(5)]
         assert np.array_equal(obs, others[-1][0])
         assert rewards == pytest.approx(sum(other[1] for other in others))
+
+
+def test_decisions_may_be_set_before_a_reset():
+    """Decisions of 1 s that are set are those of an environment made so, and a wrong one changes nothing."""
+    draw = np.random.default_rng(7).random((4, len(DRAW)))
+    changed, made = gym.make_vec(ID, num_envs=4), gym.make_vec(ID, num_envs=4, decision_s=1.0)
+    changed.unwrapped.decision_s = 1.0
+    for seconds in (0.3, 0.0, float("nan")):
+        with pytest.raises(BadInput, match="^decision_s is .*must be a multiple of 0.2 s"):
+            changed.unwrapped.decision_s = seconds
+    assert changed.unwrapped.episode_steps == made.unwrapped.episode_steps == 100
+    for batch in (changed, made):
+        batch.reset(options={"draw": draw})
+    for _ in range(5):
+        assert np.array_equal(changed.advance(up(changed, 9000.0))[0], made.advance(up(made, 9000.0))[0])
+
+
+def test_a_share_of_the_thrust_limits_commands():
+    """With half of the thrust, full commands fly as half ones do; smaller ones are as they were."""
+    draw = np.random.default_rng(8).random((4, len(DRAW)))
+    limited_ones, free_ones = gym.make_vec(ID, num_envs=4), gym.make_vec(ID, num_envs=4)
+    limited_ones.unwrapped.thrust_share = 0.5
+    for batch in (limited_ones, free_ones):
+        batch.reset(options={"draw": draw})
+    for asked, flown in ((24000.0, 12000.0), (9000.0, 9000.0)):
+        obs = limited_ones.advance(up(limited_ones, asked))[0]
+        assert np.array_equal(obs, free_ones.advance(up(free_ones, flown))[0])
 
 
 def test_what_is_hidden_and_what_an_oracle_sees():
