@@ -460,6 +460,7 @@ class Run:
 
     def __init__(self, args, saved, agent, average, optimizer, envs, env_options, describe):
         self.args, self.envs, self.env_options, self.describe = args, envs, env_options, describe
+        self.first_steps = envs.episode_steps  # training may make episodes of `envs` longer or shorter
         self.modules = {"agent": agent, "average": average, "optimizer": optimizer}
         self.rank, _ = rank_and_world_size()
         self.task: Task = task_of(args.env_id)
@@ -584,10 +585,15 @@ class Run:
     def evaluate(self, eval_seed):
         """Fly the mean action of the averaged weights and the optimum: eval.json's metrics and eval.npz's arrays."""
         average = self.modules["average"].module
-        policy = average.make_policy(self.envs.episode_steps)
+        policy = average.make_policy(self.longest_episode)
         metrics, arrays = self.task.evaluate(policy, eval_seed, self.flights(eval_seed), **self.env_options)
         device = average.actor_logstd.device.type
         return {**metrics, **self.progress, "device": device, "torch_version": torch.__version__}, arrays
+
+    @property
+    def longest_episode(self):
+        """Steps that an episode of an evaluation has at most."""
+        return max(self.first_steps, self.envs.episode_steps)
 
     def flights(self, eval_seed):
         """How many flights the evaluation of a seed has."""
@@ -601,7 +607,7 @@ class Run:
         if self.rank > 0:
             return
         metrics, arrays = self.evaluate(args.eval_seed)
-        timed_policy = self.modules["average"].module.make_policy(self.envs.episode_steps) if args.eval_only else None
+        timed_policy = self.modules["average"].module.make_policy(self.longest_episode) if args.eval_only else None
         metrics |= self.task.reported_metrics(metrics, timed_policy, **self.env_options)
         if args.eval_only:
             write_evaluation(metrics, arrays, args.checkpoint, args.eval_json, args.eval_npz)
