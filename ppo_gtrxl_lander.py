@@ -121,7 +121,7 @@ OURS = {
     "memory_length": 8,  # with 32 it learns more slowly what has failed
     "mlp_dim": 64,
     "hidden_dim": 64,
-    "total_updates": 500,
+    "total_updates": 450,
     "num_envs": 512,
     "num_minibatches": 16,
     "flights_per_start": 32,
@@ -134,12 +134,12 @@ OURS = {
     "vf_coef": 0.5,
     "target_kl": 0.03,
     "memory_noise": "0:0.01 1:0",
-    "log_std": "0:-1 0.4:-2.6 1:-3.6",  # a policy that learned with less noise has less reserve
+    "log_std": "0:-1 0.6:-2.5 1:-3.6",  # a policy that learned with less noise has less reserve
     "fuel_weight": 5.0,
-    "slope_weight": "0:0 0.2:0 0.5:2",  # not before the pad is reached: a steep crash is a crash
+    "slope_weight": "0:0 0.5:0 0.7:2",  # late: with much noise a steep descent has to be a slow one
     "weight_average": 0.998,
     "decision_s": 0.4,
-    "action_hold": "0:2.5 0.55:2.5 0.75:1",  # noise that is held explores farther, and steps of 1 s are cheap
+    "action_hold": "0:2.5 0.65:2.5 0.8:1",  # noise that is held explores farther, and steps of 1 s are cheap
 }
 MARS = {
     **OURS,

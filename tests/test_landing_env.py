@@ -190,9 +190,9 @@ def test_the_slope_is_that_of_the_last_two_metres():
 
 
 def test_the_slope_pays_by_doublings():
-    """Steeper than 20 : 1 pays nothing more; half as steep costs ln 2 of the price each time, down to 1 : 20."""
-    slope = np.array([1e9, 20.0, 10.0, 5.0, 0.05, 0.0])
-    assert slope_reward(slope, 2.0) == pytest.approx(-2 * np.log([1.0, 1.0, 2.0, 4.0, 400.0, 400.0]))
+    """Steeper than 10 : 1 pays nothing more; half as steep costs ln 2 of the price each time, down to 1 : 20."""
+    slope = np.array([1e9, 10.0, 5.0, 2.5, 0.05, 0.0])
+    assert slope_reward(slope, 2.0) == pytest.approx(-2 * np.log([1.0, 1.0, 2.0, 4.0, 200.0, 200.0]))
 
 
 # ---------------------------------------------------------------------------------------------------------------------
