@@ -5,9 +5,10 @@
     python evaluate.py figures results/di             # redraw its figures and print its table (a run folder works too)
     python evaluate.py animate results/di             # and its figures/animation.gif
     python evaluate.py opponents results/rocket_cutoff     # classical guidance on its policy's dispersed flights
+    python evaluate.py export results/rocket_cutoff --onnx policy.onnx     # the policy, or its flights, for other tools
 
 What is measured, printed and drawn of a problem is its family's: `phased/` and `rocket/`. Reading order: evaluation,
-results folders, command line.
+results folders, exports, command line.
 """
 
 from __future__ import annotations
@@ -15,17 +16,27 @@ from __future__ import annotations
 import subprocess
 import sys
 import tempfile
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 
 import baselines  # noqa: F401 - makes every id known to `task_of`
 from common.checkpoints import read_checkpoint, write_bfloat16
-from common.command_line import OneLineParser, integer, named_path, positive
+from common.command_line import OneLineParser, epoch, integer, longitude, named_path, output_file, positive
 from common.curves import evaluated, read_csv, read_curve, write_csv
+from common.errors import BadInput
 from common.evaluations import read_evaluation, read_json, read_metrics, sha256_of
 from common.files import read_npz, write_bytes, write_npz
+from common.policies import script_of
 from common.tasks import task_of
+from formats.columns import csv_bytes
+from formats.czml import czml_bytes
+from formats.oem import oem_bytes
+from formats.policy import onnx_bytes
+
+EPOCH = datetime(2026, 1, 1, tzinfo=UTC)  # of an exported lift-off
+LAUNCH_LONGITUDE = -80.6  # degrees east: Cape Canaveral
 
 
 def evaluate(env_id: str, policy, eval_seed: int, n: int, reference: dict | None = None, **env_options):
@@ -89,12 +100,8 @@ def shorten(run_dir) -> Path:
     OSError or BadInput says what is missing, ValueError what its script says when it cannot fly the policy.
     """
     run_dir = Path(run_dir)
-    args = read_checkpoint(run_dir / "agent.safetensors", {"exp_name": str}, flag="")["args"]
-    script = Path(__file__).with_name(f"{args['exp_name']}.py")
-    if not script.is_file():
-        raise ValueError(
-            f"{run_dir}: its exp_name is {args['exp_name']!r}; it must be that of a script, which flies it"
-        )
+    args = read_checkpoint(run_dir / "agent.safetensors", {}, flag="")["args"]
+    script = script_of(run_dir / "agent.safetensors")
     with tempfile.TemporaryDirectory() as name:
         staged = Path(name)
         for path in run_dir.glob("events.out.tfevents.*"):
@@ -190,6 +197,40 @@ def seed_lines(folder) -> list[str]:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
+# Exports
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def export(folder, targets: dict[str, Path], epoch: datetime = EPOCH, launch_longitude: float = LAUNCH_LONGITUDE):
+    """Write what other tools read of a results or run folder; `targets` are files by format.
+
+    - onnx: one step of the policy, as a model
+    - csv: its flights, a row each step
+    - flights: its flights, a row each
+    - oem, czml: a rocket's flight around the Earth; lift-off is at `epoch`, from `launch_longitude` (degrees east)
+
+    BadInput where the folder has no such thing, or a package is missing. Then no file is written.
+    """
+    folder = Path(folder)
+    made = {}
+    if "onnx" in targets:
+        made["onnx"] = onnx_bytes(folder / "agent.safetensors")
+    if targets.keys() - {"onnx"}:
+        metrics, arrays = read_evaluation(folder)
+        task = task_of(metrics["env_id"])
+        place = {"epoch": epoch, "launch_longitude": launch_longitude}
+        make = {
+            "csv": lambda: csv_bytes(task.step_columns(arrays, launch_longitude)),
+            "flights": lambda: csv_bytes(task.flight_columns(arrays, metrics)),
+            "oem": lambda: oem_bytes(task.track(arrays), **place),
+            "czml": lambda: czml_bytes(task.track(arrays), **place),
+        }
+        made |= {name: make[name]() for name in targets if name in make}
+    for name, data in made.items():
+        write_bytes(targets[name], data)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 # Command line
 # ---------------------------------------------------------------------------------------------------------------------
 
@@ -225,6 +266,17 @@ def opponents_command(args):
     )
 
 
+def export_command(args):
+    targets = {name: getattr(args, name) for name in FORMATS if getattr(args, name) is not None}
+    if not targets:
+        raise BadInput(f"nothing to export: name a file by {', '.join(f'--{name}' for name in FORMATS)}")
+    if len({path.resolve() for path in targets.values()}) < len(targets):
+        raise BadInput("two of the files are one: each must have a name of its own")
+    export(args.folder, targets, args.epoch, args.launch_longitude)
+    for path in targets.values():
+        print(path)
+
+
 def print_tables(folder: Path):
     """A results or run folder's table, and that of its seeds."""
     metrics = read_json(folder / "eval.json")
@@ -237,6 +289,14 @@ COMMANDS = {
     "figures": figures_command,
     "animate": animate_command,
     "opponents": opponents_command,
+    "export": export_command,
+}
+FORMATS = {
+    "onnx": "one step of the policy, memory in and out",
+    "csv": "the flights, a row each step",
+    "flights": "the flights, a row each: a Monte Carlo",
+    "oem": "a rocket's flight as a CCSDS Orbit Ephemeris Message",
+    "czml": "a rocket's flight for Cesium",
 }
 
 
@@ -267,6 +327,14 @@ def parse_args(argv=None):
     command.add_argument("--eval-seed", type=integer(0, 2**31 - 1), default=0, metavar="S", help="default 0")
     also = "another policy, as often as wanted"
     command.add_argument("--also", type=named_path, action="append", default=[], metavar="NAME=PATH", help=also)
+    command = commands.add_parser("export", help="write the policy, or its flights, for other tools")
+    command.add_argument("folder", type=Path, help="results/<name> or runs/...")
+    for name, help_line in FORMATS.items():
+        command.add_argument(f"--{name}", type=output_file, metavar="FILE", help=help_line)
+    moment = f"lift-off of --oem and --czml, UTC: default {EPOCH:%Y-%m-%dT%H:%M:%S}"
+    command.add_argument("--epoch", type=epoch, default=EPOCH, metavar="TIME", help=moment)
+    site = f"of the launch site, degrees east: default {LAUNCH_LONGITUDE}"
+    command.add_argument("--launch-longitude", type=longitude, default=LAUNCH_LONGITUDE, metavar="L", help=site)
     return parser.parse_args(argv)
 
 

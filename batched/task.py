@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from batched import export
 from common.batch import make_batch
 from common.errors import BadInput
-from common.tasks import SampledTask
+from common.tasks import Interface, SampledTask
 
 KEPT_FLIGHTS = 100  # in a results folder
 SHOWN_FLIGHTS = 10  # in a figure
@@ -110,6 +111,20 @@ class BatchedTask(SampledTask):
     def kept_arrays(self, arrays: dict) -> dict:
         """Of the first `KEPT_FLIGHTS`; all arrays but the times are by episode."""
         return {key: array if key == "t" else array[:KEPT_FLIGHTS] for key, array in arrays.items()}
+
+    # --- what is taken along
+
+    def interface(self, **env_options) -> Interface:
+        return export.interface(self.env_id, **env_options)
+
+    def step_columns(self, arrays: dict, launch_longitude: float) -> dict:
+        return export.step_columns(arrays)
+
+    def flight_columns(self, arrays: dict, metrics: dict) -> dict:
+        return export.flight_columns(arrays)
+
+    def track(self, arrays: dict):
+        raise BadInput(f"the env_id is {self.env_id}; for OEM and CZML it must be a rocket's")
 
     # --- commands
 

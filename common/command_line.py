@@ -7,6 +7,7 @@ import math
 import os
 import sys
 from collections.abc import Callable
+from datetime import UTC, datetime
 from pathlib import Path
 
 
@@ -53,3 +54,23 @@ def named_path(text: str) -> tuple[str, Path]:
     if not name or not path:
         raise argparse.ArgumentTypeError(f"{text!r} must be NAME=PATH, a name and an agent.safetensors")
     return name, Path(path)
+
+
+def epoch(text: str) -> datetime:
+    """Argument type: a moment, ISO 8601; in UTC unless it says otherwise."""
+    try:
+        moment = datetime.fromisoformat(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{text!r} must be a moment such as 2026-01-01T12:00:00") from error
+    return moment.replace(tzinfo=UTC) if moment.tzinfo is None else moment.astimezone(UTC)
+
+
+def longitude(text: str) -> float:
+    """Argument type: degrees east."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not -180 <= value <= 360:
+        raise argparse.ArgumentTypeError(f"{text!r} must be degrees east, from -180 to 360")
+    return value

@@ -1,4 +1,4 @@
-"""A policy flown by its script in a process of its own: nothing imports a script, or torch."""
+"""A policy's script, run in a process of its own: nothing imports a script, or torch."""
 
 from __future__ import annotations
 
@@ -6,14 +6,31 @@ import subprocess
 import sys
 from pathlib import Path
 
-from common.errors import BadInput
+from common.checkpoints import read_checkpoint
+from common.errors import BadInput, refuse_unless
+
+ROOT = Path(__file__).parents[1]
+
+
+def script_of(checkpoint) -> Path:
+    """The script that trained an agent.safetensors. BadInput where the file is bad or names none."""
+    name = read_checkpoint(checkpoint, {"exp_name": str}, flag="")["args"]["exp_name"]
+    scripts = {path.stem: path for path in ROOT.glob("ppo_gtrxl_*.py")}
+    allowed = f"must be that of a script, which flies it: {', '.join(sorted(scripts))}"
+    refuse_unless(name in scripts, f"the exp_name of {checkpoint}", repr(name), allowed)
+    return scripts[name]
 
 
 def evaluate_by_script(script: Path, checkpoint, flags: dict):
     """Run `script --eval-only` on a checkpoint, on the CPU. BadInput with the script's own line where it refuses."""
     command = [sys.executable, str(script), "--eval-only", "--no-cuda", f"--checkpoint={checkpoint}"]
     command += [f"--{name}={value}" for name, value in flags.items()]
-    done = subprocess.run(command, capture_output=True, text=True)
+    run_quietly(command, checkpoint)
+
+
+def run_quietly(command: list[str], checkpoint, cwd=None):
+    """Run a command on a checkpoint. BadInput with the last line that it said where it fails."""
+    done = subprocess.run(command, capture_output=True, text=True, cwd=cwd)
     if done.returncode:
-        said = done.stderr.strip().splitlines() or [f"{script.name} ended with {done.returncode}"]
+        said = done.stderr.strip().splitlines() or [f"{command[1]} ended with {done.returncode}"]
         raise BadInput(f"{checkpoint}: {said[-1]}")

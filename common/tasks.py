@@ -9,11 +9,19 @@ a class of this shape, and one line `add_family(TABLES, make_task)` in `envs.py`
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from common.errors import BadInput
+
+
+class Interface(NamedTuple):
+    """What a policy is given and what it answers, for those who call it elsewhere."""
+
+    observation: Sequence[tuple[str, str]]  # name and unit of each number, in order
+    action: Sequence[tuple[str, str]]
+    notes: str  # frames, what was hidden, and how an action is used
 
 
 class Task(Protocol):
@@ -108,6 +116,24 @@ class Task(Protocol):
 
     def kept_arrays(self, arrays: dict) -> dict:
         """The arrays that a results folder keeps."""
+        ...
+
+    # --- what is taken along (`python evaluate.py export`)
+
+    def interface(self, **env_options) -> Interface:
+        """Names and units of what a policy observes and commands."""
+        ...
+
+    def step_columns(self, arrays: dict, launch_longitude: float) -> dict[str, Any]:
+        """The flights of eval.npz, a row each step: NumPy columns by name. The longitude is a rocket's."""
+        ...
+
+    def flight_columns(self, arrays: dict, metrics: dict) -> dict[str, Any]:
+        """The flights of eval.npz, a row each: NumPy columns by name. BadInput where there is but one."""
+        ...
+
+    def track(self, arrays: dict) -> Any:
+        """The flight around the Earth, a `formats.track.Track`; BadInput where it is none."""
         ...
 
     # --- commands

@@ -7,6 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.command_line import integer
+from common.errors import BadInput
+from common.tasks import Interface
+from landing import export
 from landing.comparison import compare
 from landing.environment import fly_lander
 from landing.lander import LANDERS, Lander
@@ -122,6 +125,20 @@ class LanderTask:
     def kept_arrays(self, arrays: dict) -> dict:
         """Of the first `KEPT_FLIGHTS`; all arrays but the period are by flight."""
         return {key: array if key == "decision_s" else array[:KEPT_FLIGHTS] for key, array in arrays.items()}
+
+    # --- what is taken along
+
+    def interface(self, **env_options) -> Interface:
+        return export.interface(self.lander, **env_options)
+
+    def step_columns(self, arrays: dict, launch_longitude: float) -> dict:
+        return export.step_columns(arrays)
+
+    def flight_columns(self, arrays: dict, metrics: dict) -> dict:
+        return export.flight_columns(arrays)
+
+    def track(self, arrays: dict):
+        raise BadInput(f"the env_id is {self.env_id}; for OEM and CZML it must be a rocket's")
 
     # --- commands
 

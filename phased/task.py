@@ -9,7 +9,8 @@ import numpy as np
 
 from common.command_line import integer
 from common.errors import BadInput
-from common.tasks import SampledTask
+from common.tasks import Interface, SampledTask
+from phased import export
 from phased.environment import fly
 from phased.metrics import flight_metrics, near_origin_metrics, ratio_metrics
 from phased.problem import Problem, flights_of_seed
@@ -132,6 +133,20 @@ class PhasedTask(SampledTask):
     def kept_arrays(self, arrays: dict) -> dict:
         """Of the first `KEPT_STARTS`; all arrays but the times are by start."""
         return {key: array if key == "t" else array[:KEPT_STARTS] for key, array in arrays.items()}
+
+    # --- what is taken along
+
+    def interface(self, **env_options) -> Interface:
+        return export.interface(self.problem, **env_options)
+
+    def step_columns(self, arrays: dict, launch_longitude: float) -> dict:
+        return export.step_columns(self.problem, arrays)
+
+    def flight_columns(self, arrays: dict, metrics: dict) -> dict:
+        return export.flight_columns(self.problem, arrays)
+
+    def track(self, arrays: dict):
+        raise BadInput(f"the env_id is {self.env_id}; for OEM and CZML it must be a rocket's")
 
     # --- commands
 

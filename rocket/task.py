@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from common.errors import BadInput
+from common.tasks import Interface
+from formats.track import Track
+from rocket import export
 from rocket.comparison import compare
 from rocket.environment import flown_mission, fly_rocket
 from rocket.metrics import (
@@ -186,6 +190,22 @@ class RocketTask:
 
     def kept_arrays(self, arrays: dict) -> dict:
         return arrays
+
+    # --- what is taken along
+
+    def interface(self, **env_options) -> Interface:
+        return export.interface(self.mission.rocket, **env_options)
+
+    def step_columns(self, arrays: dict, launch_longitude: float) -> dict:
+        return export.step_columns(self.mission.rocket, arrays, launch_longitude)
+
+    def flight_columns(self, arrays: dict, metrics: dict) -> dict:
+        if "dispersion" not in metrics:
+            raise BadInput(f"the evaluation of {self.env_id} holds one flight; --flights needs one with --dispersion")
+        return export.flight_columns(self.mission.rocket, arrays, metrics["dispersion"])
+
+    def track(self, arrays: dict) -> Track:
+        return export.earth_track(self.env_id, self.mission.rocket, arrays)
 
     # --- commands
 

@@ -1,0 +1,14 @@
+"""Packages that only an export needs."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+from common.errors import BadInput
+
+
+def need(feature: str, *packages: str):
+    """BadInput with one line that says what to install, where a package is missing."""
+    missing = [package for package in packages if find_spec(package) is None]
+    if missing:
+        raise BadInput(f"{feature} needs {' and '.join(missing)}: pip install -r requirements-extras.txt")

@@ -1,0 +1,190 @@
+"""One step of a trained policy as an ONNX model, a program of its own; `formats.policy` runs it.
+
+    python -m formats.onnx_model ppo_gtrxl_rocket results/rocket_cutoff/agent.safetensors policy.onnx
+
+The script is loaded by its file's name: its `features`, its agent and its weights are what is written, and no formula
+is written down twice but the attention of one step, whose memory is handed in and out here.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import importlib
+import json
+import logging
+import sys
+import warnings
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+from common.batch import make_batch
+from common.checkpoints import read_checkpoint
+from common.errors import BadInput
+from common.evaluations import sha256_of
+from common.files import write_bytes
+from common.tasks import task_of
+
+
+class PolicyStep(nn.Module):
+    """The mean action of one step.
+
+    Inputs: `observation` (flights, obs) float64, and `memory` (blocks, 2, flights, heads, L, dk) float32, the keys and
+    values of the L steps before, the oldest first; zeros before the first step, as evaluations begin. Outputs: `action`
+    (flights, actions) and `next_memory`, both float32. A policy without blocks, or with L = 0, has no memory.
+
+    The features are computed in float64, the network in float32, as it was trained. Some features are small differences
+    of large numbers: in float32 their rounding would be another one in each runtime.
+    """
+
+    def __init__(self, agent, features):
+        super().__init__()
+        self.agent = agent
+        self.features = features
+        self.in_float64 = copy.deepcopy(agent).double()  # its buffers are the constants of the features
+        memory = agent.new_memory(1, noise=0.0)
+        self.constants = [constants for _, *constants in agent.start_cache(memory, steps=0)]
+
+    def forward(self, observation, memory=None):
+        x = self.agent.encoder(self.features(self.in_float64, observation).float())
+        next_memory = []
+        for k, (block, constants) in enumerate(zip(self.agent.blocks, self.constants)):
+            past = None if memory is None else memory[k]
+            attended, kept = attend(block.attention, x, past, *constants)
+            x = block(x, attended)
+            next_memory.append(kept)
+        action = self.agent.get_mean_action(x)
+        return action if memory is None else (action, torch.stack(next_memory))
+
+
+def attend(attention, x, past, projections, R):
+    """`RelativeAttention.step` of x (N, d) with the keys and values `past` (2, N, H, L, dk), or without any.
+
+    Returns MultiHead(x) (N, d), and the keys and values of the last L steps, this one's included.
+    """
+    qkv = F.linear(x, projections)  # (N, 3 d)
+    qkv = qkv.unflatten(-1, (3, attention.num_heads, 1, attention.dk)).transpose(0, 1)  # (3, N, H, 1, dk)
+    kv = qkv[1:] if past is None else torch.cat([past, qkv[1:]], dim=3)  # (2, N, H, L + 1, dk)
+    k, v = kv
+    scores = qkv[0] @ (k + R).transpose(-1, -2)  # (N, H, 1, L + 1)
+    attended = scores.softmax(dim=-1) @ v  # (N, H, 1, dk)
+    return attention.out(attended.flatten(1)), kv[:, :, :, 1:]
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# What torch's exporter or onnxruntime does not have
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def translations():
+    """Operations of the features that torch's exporter does not know, or that onnxruntime has in float32 alone."""
+    from onnxscript import opset18  # pyright: ignore[reportMissingImports] - optional
+
+    op: Any = opset18
+    FLOAT, DOUBLE, INT64 = 1, 11, 7  # of TensorProto.DataType
+
+    def searchsorted(sorted_sequence, self, *, out_int32=False, right=False, side=None, sorter=None):
+        """The number of entries (of a short table) that are below."""
+        values = op.Unsqueeze(self, [-1])
+        is_below = op.LessOrEqual(sorted_sequence, values) if right else op.Less(sorted_sequence, values)
+        return op.ReduceSum(op.Cast(is_below, to=INT64), [-1], keepdims=0)
+
+    def atan2(self, other):
+        """In float32, and then one step of Newton's method in float64."""
+        y, x = op.Cast(self, to=FLOAT), op.Cast(other, to=FLOAT)
+        first = op.Atan(op.Div(y, x))
+        half_turn = op.Where(op.Less(y, 0.0), -3.14159265, 3.14159265)
+        first = op.Cast(op.Where(op.Less(x, 0.0), op.Add(first, half_turn), first), to=DOUBLE)
+        sine, cosine = op.Sin(first), op.Cos(first)
+        across = op.Sub(op.Mul(self, cosine), op.Mul(other, sine))
+        along = op.Add(op.Mul(other, cosine), op.Mul(self, sine))
+        return op.Add(first, op.Div(across, along))
+
+    def asinh(self):
+        size = op.Abs(self)
+        root = op.Sqrt(op.Add(op.Mul(size, size), op.CastLike(1.0, size)))
+        return op.Mul(op.Sign(self), op.Log(op.Add(size, root)))
+
+    aten = torch.ops.aten
+    return {aten.searchsorted.Tensor: searchsorted, aten.atan2.default: atan2, aten.asinh.default: asinh}
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# From a checkpoint to a model
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def load(script, checkpoint):
+    """The agent of an agent.safetensors, its arguments, and the environment that it flies. BadInput if it is damaged"""
+    defaults = {field.name: getattr(script.Args, field.name) for field in fields(script.Args)}
+    sizes = ("num_blocks", "embed_dim", "num_heads", "memory_length", "mlp_dim", "hidden_dim")
+    kinds = {name: type(defaults[name]) for name in ("env_id", *sizes)}
+    saved = read_checkpoint(checkpoint, kinds, script.ENV_IDS, defaults, flag="")
+    args = script.Args(**{name: saved["args"][name] for name in defaults})
+    options = {name: getattr(args, name) for name in script.ENV_OPTIONS} | script.FIXED_OPTIONS
+    envs = make_batch(args.env_id, 1, **options)
+    agent = script.Agent(args, envs)
+    try:
+        agent.load_state_dict({name: torch.from_numpy(array.copy()) for name, array in saved["tensors"].items()})
+    except RuntimeError as error:
+        why = "does not fit its own args; fly it by the version that trained it (CHANGELOG.md)"
+        raise BadInput(f"{checkpoint}: {why}: {error}") from error
+    return agent.eval(), args, options, envs
+
+
+def export(script, checkpoint) -> Any:
+    """The ONNX program of a policy, with its metadata."""
+    agent, args, options, envs = load(script, checkpoint)
+    names, shapes = ["observation"], {"observation": {0: torch.export.Dim("flights")}}
+    inputs = [torch.ones(2, *envs.single_observation_space.shape, dtype=torch.float64)]
+    outputs = ["action"]
+    if args.num_blocks and args.memory_length:
+        heads, dk = args.num_heads, args.embed_dim // args.num_heads
+        inputs.append(torch.zeros(args.num_blocks, 2, 2, heads, args.memory_length, dk))
+        names.append("memory")
+        shapes["memory"] = {2: shapes["observation"][0]}
+        outputs.append("next_memory")
+    program = torch.onnx.export(
+        PolicyStep(agent, script.features).eval(),
+        tuple(inputs),
+        dynamo=True,
+        input_names=names,
+        output_names=outputs,
+        dynamic_shapes=shapes,
+        custom_translation_table=translations(),
+        verbose=False,
+    )
+    assert program is not None
+    interface = task_of(args.env_id).interface(**options)
+    metadata = {
+        "env_id": args.env_id,
+        "checkpoint_sha256": sha256_of(checkpoint),
+        "step_s": f"{envs.dt:g}",
+        "steps": str(envs.episode_steps),
+        "observation": json.dumps(interface.observation),
+        "action": json.dumps(interface.action),
+        "notes": interface.notes,
+    }
+    program.model.metadata_props.update(metadata)
+    return program
+
+
+def main(script_name, checkpoint, target):
+    """Write the model of `checkpoint` to `target`; one line on stderr and status 1 if that cannot be done."""
+    warnings.simplefilter("ignore")
+    logging.disable(logging.WARNING)  # torch's exporter names every optional package that is missing
+    try:
+        with contextlib.redirect_stdout(sys.stderr):
+            program = export(importlib.import_module(script_name), checkpoint)
+        write_bytes(target, program.model_proto.SerializeToString())
+    except (BadInput, OSError) as error:
+        sys.exit(str(error))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], Path(sys.argv[2]), Path(sys.argv[3]))

@@ -1,0 +1,21 @@
+"""A policy as an ONNX model: made by `formats.onnx_model` in a process of its own, for nothing here imports torch."""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from pathlib import Path
+
+from common.policies import ROOT, run_quietly, script_of
+from formats.extras import need
+
+
+def onnx_bytes(checkpoint: Path) -> bytes:
+    """The model of an agent.safetensors. BadInput where it is damaged or a package is missing."""
+    need("--onnx", "onnx", "onnxscript")
+    script = script_of(checkpoint)
+    with tempfile.TemporaryDirectory() as folder:
+        target = Path(folder) / "policy.onnx"
+        command = [sys.executable, "-m", "formats.onnx_model", script.stem, str(checkpoint.resolve()), str(target)]
+        run_quietly(command, checkpoint, cwd=ROOT)
+        return target.read_bytes()

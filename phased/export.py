@@ -1,0 +1,83 @@
+"""What is taken along of a small problem's flights: names of a policy's numbers, columns of a table."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from common.tasks import Interface
+from formats.columns import held, named, numbered, stacked
+from phased.problem import Problem
+
+
+def state_names(problem: Problem) -> list[str]:
+    """x1, x2, ..., as the paper counts."""
+    return numbered("x", problem.states)
+
+
+def control_names(problem: Problem) -> list[str]:
+    """u, or u1, u2, ..."""
+    return ["u"] if problem.controls == 1 else numbered("u", problem.controls)
+
+
+def interface(
+    problem: Problem,
+    observe_phase: bool = True,
+    observe_velocity: bool = True,
+    observe_draw: bool = False,
+    observe_command: bool = False,
+    scaled_action: bool = False,
+) -> Interface:
+    """What a policy on these options of the environment observes and commands."""
+    states, controls = state_names(problem), control_names(problem)
+    clocks = ["tau", "phi"] if problem.waypoints else ["tau"]
+    seen = list(states)
+    if problem.waypoints:
+        seen += [f"{name}_target" for name in states]
+    seen += clocks
+    if observe_draw:
+        seen += numbered("score", problem.scores)
+    if observe_command:
+        seen += [f"{name}_before" for name in controls]
+    longest = problem.steps * problem.dt
+    notes = f"Units are the table's. tau: time / {longest:g} s, at most 1. "
+    if problem.waypoints:
+        notes += "The targets move to a new phase's over its first 5 steps. phi: the phase, from 0 to 1. "
+    hidden = [] if observe_phase else clocks
+    hidden += [] if observe_velocity else [states[k] for k in problem.hidden_velocities]
+    if hidden:
+        notes += f"Hidden in training, give 0: {', '.join(hidden)}. "
+    low, high = problem.u_box.tolist()
+    if scaled_action:
+        notes += f"Control: {problem.u_centre.tolist()} + {problem.u_unit.tolist()} x action, "
+    else:
+        notes += "Control: the action, "
+    bound = f"within {low} to {high}" if problem.u_norm is None else f"its norm within {list(problem.u_norm)}"
+    notes += f"clipped {bound}, held for {problem.dt:g} s."
+    return Interface([(name, "1") for name in seen], [(name, "1") for name in controls], notes)
+
+
+def step_columns(problem: Problem, arrays: dict) -> dict[str, np.ndarray]:
+    """The flights below one another, a row each state: time (s), state, and the control from there on."""
+    x = arrays["x"]
+    u = arrays["u"].reshape(*arrays["u"].shape[:2], problem.controls)
+    times = np.tile(arrays["t"], (len(x), 1))
+    if "final_time" in arrays:  # an event ended the last step before its end
+        times = np.minimum(times, arrays["final_time"][:, None])
+    lives = np.isfinite(x).all(axis=2)
+    columns = {"t_s": times, **named(state_names(problem), x), **named(control_names(problem), held(u))}
+    return stacked(columns, lives)
+
+
+def flight_columns(problem: Problem, arrays: dict) -> dict[str, np.ndarray]:
+    """A row for each flight: start, end, cost, and the optimum's cost from the same start."""
+    x = arrays["x"]
+    last = np.isfinite(x).all(axis=2).sum(axis=1) - 1
+    names = state_names(problem)
+    columns = {"flight": np.arange(len(x))}
+    if "draw" in arrays:
+        columns |= named(numbered("score", problem.scores), arrays["draw"])
+    columns |= named([f"{name}_start" for name in names], x[:, 0])
+    columns |= named([f"{name}_end" for name in names], x[np.arange(len(x)), last])
+    if "final_time" in arrays:
+        columns["t_end_s"] = arrays["final_time"]
+    return columns | {"cost": arrays["cost"], "cost_of_optimum": arrays["cost_reference"]}

@@ -1,0 +1,95 @@
+"""What is taken along of a rocket's flights: names and units of a policy's numbers, columns of a table, the track."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from common.errors import refuse_unless
+from common.tasks import Interface
+from formats.columns import named
+from formats.track import Track, over_ground
+from rocket.comparison import recorded_flights
+from rocket.dispersion import draw_names
+from rocket.metrics import apsides
+from rocket.orbits import target_axes
+from rocket.vehicle import Rocket
+
+POSITION, VELOCITY = ("x_m", "y_m", "z_m"), ("vx_m_s", "vy_m_s", "vz_m_s")
+STATE = (*POSITION, *VELOCITY, "mass_kg")
+ACTIONS = {"eci": ("x", "y", "z"), "local": ("up", "along_track", "cross_track")}
+
+
+def interface(
+    rocket: Rocket, action_frame: str = "eci", observe_phase: bool = True, observe_draw: bool = False, **options
+) -> Interface:
+    """What a policy on these options of the environment observes and commands."""
+    units = [*["m"] * 3, *["m/s"] * 3, "kg", "1", "1"]
+    observation = list(zip(("x", "y", "z", "vx", "vy", "vz", "mass", "time_left", "phase"), units))
+    if observe_draw:
+        observation += [(name, "1") for name in draw_names(rocket)]
+    notes = "Position and velocity: inertial, x through the launch meridian at lift-off, z the Earth's axis. "
+    notes += f"time_left: 1 - t / {rocket.end_time:g} s. phase: the burn, from 0, / {max(len(rocket.burns) - 1, 1)}. "
+    if not observe_phase:
+        notes += "time_left and phase were hidden in training: give 0. "
+    notes += "Action: the direction of thrust, held in inertial axes until the next step. "
+    if action_frame == "local":
+        normal = ", ".join(f"{component:.9f}" for component in target_axes(rocket)[2])
+        notes += f"up = r / |r|; along_track = n x up over its length, n = ({normal}); cross_track = up x along_track."
+    return Interface(observation, [(name, "1") for name in ACTIONS[action_frame]], notes.strip())
+
+
+def step_columns(rocket: Rocket, arrays: dict, launch_longitude: float) -> dict[str, np.ndarray]:
+    """The nominal flight, a row each step: the state, the thrust's direction from there on, the burn, from 1."""
+    track = track_of("", rocket, arrays)
+    ends = [burn.end for burn in rocket.burns[:-1]]
+    direction = np.vstack([arrays["u"], np.full((1, 3), np.nan)])
+    return {
+        "t_s": arrays["t"],
+        **named(STATE, arrays["y"]),
+        **named(("thrust_x", "thrust_y", "thrust_z"), direction),
+        "burn": 1 + np.searchsorted(ends, arrays["t"], side="right"),
+        **over_ground(track, launch_longitude),
+    }
+
+
+def flight_columns(rocket: Rocket, arrays: dict, dispersion: float) -> dict[str, np.ndarray]:
+    """The dispersed flights, a row each: standard scores, end, and the orbit."""
+    flights = recorded_flights(arrays, rocket, dispersion)
+    orbit = {key: flights[key] for key in ("error_norm", "a_km", "e", "i_deg", "raan_deg", "argp_deg")}
+    perigee, apogee = (apsides_of(flights, rocket)[key] for key in ("perigee_km", "apogee_km"))
+    return {
+        "flight": np.arange(len(arrays["draw"])),
+        **named([f"score_{name}" for name in draw_names(rocket)], arrays["draw"]),
+        "t_s": arrays["final_t"],
+        **named(STATE, arrays["final_y"]),
+        **orbit,
+        "perigee_km": perigee,
+        "apogee_km": apogee,
+        "dry": flights["dry"],
+        "crashed": flights["crashed"],
+    }
+
+
+def apsides_of(flights: dict, rocket: Rocket) -> dict:
+    """Altitudes of perigee and apogee (n,) in km; no apogee, NaN, on a hyperbola."""
+    both = [apsides(a, e, rocket) for a, e in zip(flights["a_km"], flights["e"])]
+    found = {key: np.array([row[key] for row in both]) for key in ("perigee_km", "apogee_km")}
+    return {key: np.where(np.isfinite(values), values, np.nan) for key, values in found.items()}
+
+
+def track_of(name: str, rocket: Rocket, arrays: dict) -> Track:
+    """The nominal flight."""
+    begins = [0.0, *(burn.end for burn in rocket.burns[:-1])]
+    end = arrays["t"][-1]
+    burns = zip(begins, rocket.burns)
+    events = [
+        (begin, "coast" if burn.is_coast else f"burn {k}") for k, (begin, burn) in enumerate(burns, 1) if begin < end
+    ]
+    y = arrays["y"]
+    return Track(name, arrays["t"], y[:, :3], y[:, 3:6], events, rocket.Re, rocket.omega_e)
+
+
+def earth_track(env_id: str, rocket: Rocket, arrays: dict) -> Track:
+    """The track of a rocket that is launched from the Earth; BadInput for another planet's."""
+    refuse_unless(rocket.body == "Earth", f"mu of {env_id}", rocket.mu, "must be the Earth's: OEM and CZML name it")
+    return track_of(env_id, rocket, arrays)
