@@ -133,7 +133,7 @@ def load(script, checkpoint):
         agent.load_state_dict({name: torch.from_numpy(array.copy()) for name, array in saved["tensors"].items()})
     except RuntimeError as error:
         why = "does not fit its own args; fly it by the version that trained it (CHANGELOG.md)"
-        raise BadInput(f"{checkpoint}: {why}: {error}") from error
+        raise BadInput(f"{checkpoint}: {why}: {' '.join(str(error).split())}") from error
     return agent.eval(), args, options, envs
 
 
