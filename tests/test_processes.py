@@ -1,8 +1,9 @@
-"""Several processes (torchrun) against one: gradients, weights, statistics, a rank that dies, resume."""
+"""Several processes (torchrun, on one machine or several) against one: gradients, weights, a rank that dies, resume."""
 
 import copy
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -37,11 +38,11 @@ def share(batch, episodes):
     return script.Batch(*(getattr(batch, name)[:, episodes].clone() for name in list(vars(batch))[:7]))
 
 
-def learn(rank, world, folder, settings):
-    """One update of this rank's half of the episodes; saves what came of it."""
+def learn(rank, world, folder, settings, meeting=None):
+    """One update of this rank's half of the episodes; saves what came of it. The ranks meet there, or in the folder."""
     torch.set_num_threads(1)
     if world > 1:
-        dist.init_process_group("gloo", init_method=f"file://{folder}/meet", rank=rank, world_size=world)
+        dist.init_process_group("gloo", init_method=meeting or f"file://{folder}/meet", rank=rank, world_size=world)
     settings = {"learning_rate": 1e-3, **settings}
     args = script.Args(**SIZES, num_minibatches=2, update_epochs=2, **settings)
     envs = UnevenEnvs(LENGTHS)
@@ -81,16 +82,31 @@ def learn(rank, world, folder, settings):
     ids=["plain", "groups", "kl_stop"],
 )
 def test_two_processes_learn_what_one_does(tmp_path, settings):
+    save_batch(tmp_path)
+    for world in (1, 2):
+        start_ranks(tmp_path, world, settings)
+    check_against_one_process(tmp_path, settings)
+
+
+def save_batch(folder):
+    """The episodes that all of them learn from."""
     torch.manual_seed(0)
     args, envs = script.Args(**SIZES), UnevenEnvs(LENGTHS)
-    torch.save(batch_of(envs, script.Agent(args, envs))[0], tmp_path / "batch.pt")
+    torch.save(batch_of(envs, script.Agent(args, envs))[0], folder / "batch.pt")
+
+
+def start_ranks(folder, world, settings):
+    """`learn` in so many processes, to their ends."""
     context = multiprocessing.get_context("forkserver")
-    for world in (1, 2):
-        ranks = [context.Process(target=learn, args=(rank, world, str(tmp_path), settings)) for rank in range(world)]
-        [process.start() for process in ranks]
-        [process.join(120) for process in ranks]
-        assert [process.exitcode for process in ranks] == [0] * world
-    one, first, second = (torch.load(tmp_path / f"{name}.pt") for name in ("1_0", "2_0", "2_1"))
+    ranks = [context.Process(target=learn, args=(rank, world, str(folder), settings)) for rank in range(world)]
+    [process.start() for process in ranks]
+    [process.join(120) for process in ranks]
+    assert [process.exitcode for process in ranks] == [0] * world
+
+
+def check_against_one_process(folder, settings):
+    """What the two ranks learned is what one process did: gradients, weights, losses, advantages."""
+    one, first, second = (torch.load(folder / f"{name}.pt") for name in ("1_0", "2_0", "2_1"))
     assert len(one["gradients"]) == len(first["gradients"]) == len(second["gradients"])
     assert len(one["gradients"]) == 4 if "target_kl" not in settings else 1 <= len(one["gradients"]) < 4
     for gradient, *others in zip(one["gradients"], first["gradients"], second["gradients"]):
@@ -118,6 +134,93 @@ def torchrun(folder, *argv, wait=True):
         output, _ = process.communicate(timeout=120)
         assert process.returncode == 0, output
     return process
+
+
+# --- several machines: torchrun's agents that meet over TCP, here on the loopback -------------------------------------
+
+
+def free_port():
+    with socket.socket() as asked:
+        asked.bind(("127.0.0.1", 0))
+        return asked.getsockname()[1]
+
+
+def two_machines(folders, program, *argv, rendezvous):
+    """Start torchrun in each folder, as on a machine of its own with one process; returns both agents."""
+    command = [sys.executable, "-m", "torch.distributed.run", "--nnodes=2", "--nproc_per_node=1"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    port, agents = free_port(), []
+    for rank, folder in enumerate(folders):
+        if rendezvous == "static":
+            meet = [f"--node-rank={rank}", "--master-addr=127.0.0.1", f"--master-port={port}"]
+        else:
+            meet = ["--rdzv-backend=c10d", f"--rdzv-endpoint=127.0.0.1:{port}", "--rdzv-id=test"]
+        words = [*command, *meet, str(program), *map(str, argv)]
+        agents.append(subprocess.Popen(words, cwd=folder, env=environment, **streams))
+    return agents
+
+
+def ends_of(agents, timeout=120):
+    """Exit statuses and outputs of both agents."""
+    outputs = [agent.communicate(timeout=timeout)[0] for agent in agents]
+    return [agent.returncode for agent in agents], outputs
+
+
+def test_two_machines_learn_what_one_process_does(tmp_path):
+    save_batch(tmp_path)
+    start_ranks(tmp_path, 1, {})
+    agents = two_machines([tmp_path, tmp_path], Path(__file__), tmp_path, rendezvous="c10d")
+    statuses, outputs = ends_of(agents)
+    assert statuses == [0, 0], outputs
+    check_against_one_process(tmp_path, {})
+
+
+def folders_of(tmp_path, *names):
+    folders = [tmp_path / name for name in names]
+    for folder in folders:
+        folder.mkdir()
+    return folders
+
+
+def state_in(folder):
+    """The training state of the one run below a folder."""
+    (run,) = (folder / "runs").iterdir()
+    assert (run / "eval.json").exists()
+    return torch.load(run / "training_state.pt", weights_only=True)
+
+
+def test_two_machines_train_as_two_processes_of_one(tmp_path):
+    """The script's run, to the last bit; its folder is on the first machine alone."""
+    argv = [*NETWORK, "--num-envs=5", "--num-minibatches=2", "--eval-starts=10", "--total-updates=3", "--eval-every=0"]
+    alone, first, second = folders_of(tmp_path, "alone", "first", "second")
+    torchrun(alone, *argv)
+    statuses, outputs = ends_of(two_machines([first, second], script.__file__, *argv, rendezvous="static"))
+    assert statuses == [0, 0], outputs
+    assert not list(second.iterdir())
+    here, there = state_in(alone), state_in(first)
+    for part in ("agent", "average"):
+        torch.testing.assert_close(there[part], here[part], rtol=0, atol=0)
+
+
+def test_a_machine_that_dies_ends_the_other(tmp_path):
+    """The second one is killed, agent and worker; the first one fails within 60 s and keeps its last checkpoint."""
+    argv = [*NETWORK, "--num-envs=5", "--num-minibatches=2", "--total-updates=100000", "--eval-every=0"]
+    folders = folders_of(tmp_path, "first", "second")
+    agents = two_machines(folders, script.__file__, *argv, "--eval-starts=10", rendezvous="static")
+    while not list(folders[0].glob("runs/*/agent.safetensors")):
+        assert all(agent.poll() is None for agent in agents), ends_of(agents)
+        time.sleep(0.05)
+    for pid in (*children(agents[1].pid), agents[1].pid):
+        os.kill(pid, signal.SIGKILL)
+    killed = time.time()
+    statuses, outputs = ends_of(agents, timeout=60)
+    assert all(statuses) and time.time() - killed < 60, outputs
+    (run,) = folders[0].glob("runs/*")
+    assert (run / "training_state.pt").exists() and not (run / "eval.json").exists()
+
+
+# --- torchrun's processes of one machine ------------------------------------------------------------------------------
 
 
 def children(pid):
@@ -197,3 +300,7 @@ def test_moments_are_those_of_the_living(monkeypatch):
     mean, variance = script.moments(torch.tensor(x), torch.tensor(alive), (0, 1))
     living = copy.copy(x[alive > 0])
     assert (mean.item(), variance.item()) == pytest.approx((living.mean(), living.var()))
+
+
+if __name__ == "__main__":  # a rank that torchrun started, of `test_two_machines_learn_what_one_process_does`
+    learn(int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"]), sys.argv[1], {}, meeting="env://")
