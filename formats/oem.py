@@ -1,4 +1,4 @@
-"""A flight as a CCSDS Orbit Ephemeris Message (502.0-B-3), by the `oem` package: GMAT, STK and Orekit read it.
+"""A flight as a CCSDS Orbit Ephemeris Message (502.0-B-2), by the `oem` package: GMAT, STK and Orekit read it.
 
 Frame TOD, the true equator and equinox of date: its z axis is the Earth's, as ours is. The true sidereal time of the
 epoch and the launch site's longitude turn our x axis into its own. UT1 is taken for UTC: less than 0.9 s, 0.4 km of the

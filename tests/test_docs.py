@@ -7,6 +7,7 @@ import json
 import re
 import shlex
 import subprocess
+import tomllib
 from pathlib import Path
 
 import memory
@@ -16,6 +17,7 @@ import pytest
 import baselines
 import envs
 import runs
+from common.checkpoints import read_checkpoint
 from phased.problem import flights_of_seed
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -86,6 +88,31 @@ def test_commands_name_what_is_there(page):
         args, _ = runs.read_flags(script.Args(), words[words.index(files[0]) + 1 :])
         if not any("runs/" in word for word in words):  # the reader's run, of which a page cannot know
             runs.check(args, script.ENV_IDS)
+
+
+def test_the_python_versions_are_one():
+    """Of the front page, of the workflow's jobs and of pyproject.toml; and the requirements are one list."""
+    readme = (ROOT / "README.md").read_text()
+    workflow = (ROOT / ".github" / "workflows" / "tests.yml").read_text()
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    oldest, newest = re.search(r'python-version: \["(\S+)", "(\S+)"\]', workflow).groups()
+    (on_mac,) = re.findall(r'os: macos-latest\n +python-version: "(\S+)"', workflow)
+    assert f"Python {oldest} to {newest}" in readme
+    assert f"with {oldest} and {newest} on Linux and with {on_mac} on macOS" in readme
+    minor = int(newest.removeprefix("3.")) + 1
+    assert project["project"]["requires-python"] == f">={oldest},<3.{minor}"
+    assert project["project"]["dynamic"] == ["dependencies"] and "dependencies" not in project["project"]
+    assert project["tool"]["setuptools"]["dynamic"]["dependencies"] == {"file": ["requirements.txt"]}
+
+
+def test_the_page_s_policy_in_c_is_the_model_s():
+    """The names and the memory's shape of docs/take-with-you.md, by the arguments of the policy that it exports."""
+    (code,) = re.findall(r"```cpp\n(.*?)```", (ROOT / "docs" / "take-with-you.md").read_text(), flags=re.DOTALL)
+    args = read_checkpoint(ROOT / "results" / "rocket_cutoff" / "agent.safetensors", {})["args"]
+    heads, length, dk = args["num_heads"], args["memory_length"], args["embed_dim"] // args["num_heads"]
+    shape = [args["num_blocks"], 2, 1, heads, length, dk]
+    assert f"shape{{{', '.join(map(str, shape))}}}" in code and " * ".join(map(str, shape)) in code
+    assert re.findall(r'"(\w+)"', code) == ["observation", "memory", "action", "next_memory"]
 
 
 def row_of(result):

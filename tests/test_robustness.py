@@ -17,6 +17,7 @@ import pytest
 import torch
 
 pytestmark = pytest.mark.slow
+linux = pytest.mark.skipif(sys.platform != "linux", reason="counts by /proc, or is about glibc")
 
 ROOT = Path(__file__).parent.parent
 SCRIPT = ROOT / "ppo_gtrxl_di.py"
@@ -74,6 +75,7 @@ def test_full_disk_leaves_the_old_checkpoint(robustness, tmp_path):
 # --- many updates, many environments ----------------------------------------------------------------------------------
 
 
+@linux
 def test_soak(robustness):
     """After the first 100 of 200 tiny updates neither memory, open files nor tensors grow (benchmark: 2000).
 
@@ -118,6 +120,7 @@ def test_thousands_of_environments(robustness, tmp_path, monkeypatch, name, numb
     assert flown == number * steps if name == "di" else number < flown < number * steps  # some crash
 
 
+@linux
 def test_freed_memory_is_kept():
     """A large tensor, freed and made again twenty times: its 24 414 pages come from the system a few times at most."""
     code = """
