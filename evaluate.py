@@ -23,7 +23,7 @@ import numpy as np
 
 import baselines  # noqa: F401 - makes every id known to `task_of`
 from common.checkpoints import read_checkpoint, write_bfloat16
-from common.command_line import OneLineParser, epoch, integer, longitude, named_path, output_file, positive
+from common.command_line import OneLineParser, integer, longitude, named_path, output_file, positive, utc
 from common.curves import evaluated, read_csv, read_curve, write_csv
 from common.errors import BadInput
 from common.evaluations import read_evaluation, read_json, read_metrics, sha256_of
@@ -332,7 +332,7 @@ def parse_args(argv=None):
     for name, help_line in FORMATS.items():
         command.add_argument(f"--{name}", type=output_file, metavar="FILE", help=help_line)
     moment = f"lift-off of --oem and --czml, UTC: default {EPOCH:%Y-%m-%dT%H:%M:%S}"
-    command.add_argument("--epoch", type=epoch, default=EPOCH, metavar="TIME", help=moment)
+    command.add_argument("--epoch", type=utc, default=EPOCH, metavar="TIME", help=moment)
     site = f"of the launch site, degrees east: default {LAUNCH_LONGITUDE}"
     command.add_argument("--launch-longitude", type=longitude, default=LAUNCH_LONGITUDE, metavar="L", help=site)
     return parser.parse_args(argv)

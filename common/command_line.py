@@ -56,7 +56,7 @@ def named_path(text: str) -> tuple[str, Path]:
     return name, Path(path)
 
 
-def epoch(text: str) -> datetime:
+def utc(text: str) -> datetime:
     """Argument type: a moment, ISO 8601; in UTC unless it says otherwise."""
     try:
         moment = datetime.fromisoformat(text)

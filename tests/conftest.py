@@ -24,7 +24,7 @@ import one_update  # noqa: E402
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-LONGEST = ["test_scripts", "test_robustness", "test_run_seeds", "test_processes", "test_fuzzing"]
+LONGEST = ["test_scripts", "test_robustness", "test_run_seeds", "test_processes", "test_fuzzing", "test_onnx"]
 
 
 def pytest_collection_modifyitems(items):
