@@ -218,14 +218,14 @@ def export(folder, targets: dict[str, Path], epoch: datetime = EPOCH, launch_lon
     if targets.keys() - {"onnx"}:
         metrics, arrays = read_evaluation(folder)
         task = task_of(metrics["env_id"])
-        place = {"epoch": epoch, "launch_longitude": launch_longitude}
-        make = {
-            "csv": lambda: csv_bytes(task.step_columns(arrays, launch_longitude)),
-            "flights": lambda: csv_bytes(task.flight_columns(arrays, metrics)),
-            "oem": lambda: oem_bytes(task.track(arrays), **place),
-            "czml": lambda: czml_bytes(task.track(arrays), **place),
-        }
-        made |= {name: make[name]() for name in targets if name in make}
+        if "csv" in targets:
+            made["csv"] = csv_bytes(task.step_columns(arrays, launch_longitude))
+        if "flights" in targets:
+            made["flights"] = csv_bytes(task.flight_columns(arrays, metrics))
+        if "oem" in targets:
+            made["oem"] = oem_bytes(task.track(arrays), epoch, launch_longitude)
+        if "czml" in targets:
+            made["czml"] = czml_bytes(task.track(arrays), epoch, launch_longitude)
     for name, data in made.items():
         write_bytes(targets[name], data)
 
