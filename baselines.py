@@ -23,9 +23,7 @@ import os
 import sys
 import time
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from functools import lru_cache
-from multiprocessing import get_context
 
 import numpy as np
 
@@ -34,6 +32,7 @@ from common.errors import BadInput, NoOptimum
 from common.files import replacing, write_npz
 from common.ipopt import limit
 from common.tasks import add_family, env_ids, task_of
+from common.workers import Workers
 from envs import DOUBLE_INTEGRATOR, PROBLEMS, Problem, fly
 from phased.lqr import linearise, lqr, lqr_policy, riccati
 from phased.optimum import Job, best_solution, hermite_simpson, refined, shooting
@@ -111,7 +110,7 @@ def optimise(
     Of several `guesses` the best solution counts; one that fails is no error where another does not. Where no solution
     exists (circles, bounds or an event out of reach) the rest are IPOPT's last ones and mean nothing. Any other failure
     is a RuntimeError that names the start. Equal starts are solved once. `processes` (default: by the number of starts
-    and cores) changes only the time; they are spawned, which is safe beside the threads of other libraries.
+    and cores) changes only the time.
     """
     problem, x0 = PROBLEMS[env_id], np.asarray(x0, dtype=np.float64)
     draw = np.zeros((len(x0), problem.scores)) if draw is None else np.asarray(draw, dtype=np.float64)
@@ -121,13 +120,8 @@ def optimise(
     jobs = [Job(env_id, defect, in_circles, int(k), x0[k], draw[k]) for k in first[order]]
     if processes is None:
         processes = max(1, min(os.cpu_count() or 1, len(jobs) // STARTS_PER_PROCESS))
-    if processes == 1:
-        solutions = [_solve_start(job) for job in jobs]
-    else:
-        chunk = -(-len(jobs) // (4 * processes))
-        spawn = get_context("spawn")
-        with ProcessPoolExecutor(processes, spawn, limit.update, ({"seconds": limit["seconds"]},)) as pool:
-            solutions = list(pool.map(_solve_start, jobs, chunksize=chunk))
+    with Workers(processes) as workers:
+        solutions = workers.map(_solve_start, jobs)
     u, cost, feasible, multipliers = (list(column) for column in zip(*solutions))
     same = rank[of_start.ravel()]
     u = np.array(u)[same]

@@ -13,13 +13,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from typing import NamedTuple
 
 import numpy as np
 
 from common.errors import NoOptimum
+from common.workers import Workers
 from landing.environment import PERIOD
 from landing.lander import Lander
 from landing.optimum import Descent, Mesh, Trajectory, energy_optimal_time, solve_from_guess, straight_line
@@ -215,16 +214,13 @@ class Replanned:
     def __init__(self, lander: Lander, is_wary: bool = False, processes: int = 1):
         self.lander, self.is_wary = lander, is_wary
         self.failed, self.seconds = 0, []
-        self.processes, self.pool = processes, None
-        if processes > 1:
-            self.pool = ProcessPoolExecutor(processes, mp_context=get_context("spawn"))
+        self.workers = Workers(processes)
 
     def __enter__(self):
         return self
 
     def __exit__(self, *error):
-        if self.pool:
-            self.pool.shutdown()
+        self.workers.close()
 
     def __call__(self, obs, t):
         if t == 0:
@@ -261,7 +257,7 @@ class Replanned:
     def _replan(self, obs, flights):
         """New plans for some flights."""
         jobs = [self._job(obs[k], k) for k in flights]
-        for k, (plan, seconds) in zip(flights, self._solve(jobs)):
+        for k, (plan, seconds) in zip(flights, self.workers.map(plan_one, jobs)):
             self.seconds.append(seconds)
             self.planned_with[k] = self.estimate.effectiveness[k]
             if plan is None:
@@ -286,13 +282,6 @@ class Replanned:
         t = np.linspace(passed, plan.seconds, PLAN_INTERVALS + 1)
         rest = Trajectory(t - passed, plan.thrust_at((t[:-1] + t[1:]) / 2), plan.state_at(t))
         return Job(self.lander, descent, limits, rest)
-
-    def _solve(self, jobs: list[Job]):
-        """What `plan_one` returns of each job, in their order."""
-        if not self.pool:
-            return map(plan_one, jobs)
-        chunk = -(-len(jobs) // (2 * self.processes)) or 1
-        return self.pool.map(plan_one, jobs, chunksize=chunk)
 
     def _acceleration(self, r, v, now) -> np.ndarray:
         """The plans' over the period from `now` (n,) s on, gravity's included, with feedback, (n, 3)."""

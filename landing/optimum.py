@@ -6,9 +6,7 @@ replay by the environment, the references of many draws. CasADi is imported only
 
 from __future__ import annotations
 
-from concurrent.futures import ProcessPoolExecutor
 from functools import lru_cache
-from multiprocessing import get_context
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +14,7 @@ import numpy as np
 from common.batch import check_options
 from common.errors import NoOptimum
 from common.ipopt import SolveClock, interruptible, limit
+from common.workers import Workers
 from landing.dynamics import TINY, burn
 from landing.environment import PERIOD, LanderVectorEnv, state_of
 from landing.lander import DRAW, LANDERS, Flights, Lander, check_failure, flights
@@ -453,12 +452,8 @@ def kept_references(lander: Lander, rows: bytes, failure: tuple, processes: int)
 
 def solutions(jobs: list, processes: int) -> list:
     """What `solve_job` returns of each job, in their order."""
-    if processes == 1:
-        return [solve_job(job) for job in jobs]
-    chunk = -(-len(jobs) // (4 * processes))
-    spawn = get_context("spawn")
-    with ProcessPoolExecutor(processes, spawn, limit.update, ({"seconds": limit["seconds"]},)) as pool:
-        return list(pool.map(solve_job, jobs, chunksize=chunk))
+    with Workers(processes) as workers:
+        return workers.map(solve_job, jobs)
 
 
 def solve_job(job) -> dict | NoOptimum:

@@ -15,16 +15,15 @@ Reading order: open loop, LQR, the program of the remaining ascent, replanning, 
 from __future__ import annotations
 
 import time
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import cache
-from multiprocessing import get_context
 from typing import NamedTuple
 
 import numpy as np
 
 from common.errors import NoOptimum
 from common.ipopt import interruptible
+from common.workers import Workers
 from rocket.dispersion import draw_vehicles
 from rocket.environment import RocketVectorEnv
 from rocket.missions import ROCKETS, Mission
@@ -324,16 +323,13 @@ class Replanning:
         self.middles = middles(self.rocket)
         self.target = target_orbit(self.rocket.target, self.rocket.mu)
         self.failed, self.seconds = 0, []
-        self.processes, self.pool = processes, None
-        if processes > 1:
-            self.pool = ProcessPoolExecutor(processes, mp_context=get_context("spawn"))
+        self.workers = Workers(processes)
 
     def __enter__(self):
         return self
 
     def __exit__(self, *error):
-        if self.pool:
-            self.pool.shutdown()
+        self.workers.close()
 
     def __call__(self, obs, t):
         if t == 0:
@@ -350,7 +346,7 @@ class Replanning:
         in_last_burn = obs[:, 8] >= min(len(self.rocket.burns) - 1, 1)
         flights = [k for k in np.flatnonzero(in_last_burn) if self.plans[k]["t"][-1] - now > LAST_REPLAN]
         jobs = [(self.rocket, self._remaining_ascent(obs[k], now), self.plans[k]) for k in flights]
-        for k, (plan, seconds) in zip(flights, self._solve(jobs)):
+        for k, (plan, seconds) in zip(flights, self.workers.map(replan_one, jobs)):
             self.seconds.append(seconds)
             if plan is None:
                 self.failed += 1
@@ -365,13 +361,6 @@ class Replanning:
         burn_out = now + (mass - self.rocket.dry_mass) / flow
         end, thrust, flow, mass = (np.array([value]) for value in (burn_out, burn.thrust, flow, mass))
         return RemainingAscent(now, obs[:6], end, thrust, flow, mass, *self.target)
-
-    def _solve(self, jobs):
-        """What `replan_one` returns of each job, in their order."""
-        if not self.pool:
-            return map(replan_one, jobs)
-        chunk = -(-len(jobs) // (2 * self.processes)) or 1
-        return self.pool.map(replan_one, jobs, chunksize=chunk)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -416,10 +405,8 @@ def drawn_optima(env_id: str, dispersion: float, z, reached=None, processes: int
     if reached is not None:
         orbits = [tuple(np.array(vector) for vector in orbit_vectors(y, rocket.mu)) for y in reached]
     jobs = [(rocket, dispersion, row, orbit, guess) for row, orbit in zip(z, orbits)]
-    if processes == 1:
-        return [solve_drawn(job) for job in jobs]
-    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
-        return list(pool.map(solve_drawn, jobs, chunksize=-(-len(jobs) // (4 * processes))))
+    with Workers(processes) as workers:
+        return workers.map(solve_drawn, jobs)
 
 
 def fly_optima(env_id: str, optima: list):

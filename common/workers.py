@@ -1,0 +1,45 @@
+"""Processes that solve: jobs are shared out to them, which changes only the time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+
+from common.ipopt import limit
+
+
+class Workers:
+    """`number` processes that do jobs until `close`, or the end of a `with`. Where it is 1, this process does them.
+
+    They are spawned, which is safe beside the threads of other libraries. They start with the first jobs, and have this
+    process's limit of a solve.
+    """
+
+    def __init__(self, number: int):
+        self.number = number
+        self.pool = None
+        if number > 1:
+            self.pool = ProcessPoolExecutor(number, get_context("spawn"), set_limit, (limit["seconds"],))
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        self.close()
+
+    def close(self):
+        if self.pool:
+            self.pool.shutdown()
+
+    def map(self, function: Callable, jobs: list) -> list:
+        """function(job) of each job, in their order."""
+        if not self.pool:
+            return [function(job) for job in jobs]
+        chunk = -(-len(jobs) // (4 * self.number)) or 1
+        return list(self.pool.map(function, jobs, chunksize=chunk))
+
+
+def set_limit(seconds: float):
+    """Of this process. `limit.update` would not do: a process that is spawned is sent a copy of the dictionary."""
+    limit["seconds"] = seconds
