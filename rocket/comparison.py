@@ -42,8 +42,11 @@ KNOWLEDGE = {  # what each opponent has to know
     "tvlqr": "optimum and its gains once",
     "tvlqr_energy": "optimum and its gains once",
     "replan": "nominal model + IPOPT on board",
+    "replan_measured": "nominal exhaust velocity + IPOPT on board",
+    "replan_hint": "its own exhaust velocity, drawn + IPOPT on board",
     "optimum": "the draw itself",
 }
+REPLANS = ("replan", "replan_measured", "replan_hint")
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -107,11 +110,10 @@ class Comparison:
         self.fly("replay", guidance.open_loop(env_id), self.n)
         self.fly("tvlqr", guidance.tvlqr(env_id), self.n)
         self.fly("tvlqr_energy", guidance.tvlqr(env_id, by_energy=True), self.n)
-        with guidance.Replanning(env_id, PROCESSES) as replanning:
-            self.fly("replan", replanning, self.solved)
-            self.about["replan"] |= {"solves": len(replanning.seconds), "solves_failed": replanning.failed}
-            if replanning.seconds:
-                self.about["replan"]["decision_us"] = 1e6 * float(np.median(replanning.seconds))
+        z = draws(self.rocket, self.dispersion, self.eval_seed, self.solved)
+        drawn = guidance.drawn_exhaust(self.rocket, self.dispersion, z)
+        for name, exhaust in zip(REPLANS, (None, guidance.nominal_exhaust(self.rocket), drawn)):
+            self.replan(name, exhaust)
         self.optima = self.solve()
         self.fly("optimum", guidance.fly_optima(env_id, self.optima), self.solved)
 
@@ -119,8 +121,16 @@ class Comparison:
         """Fly an opponent on the first n draws; what solves tells the time of its decisions itself."""
         _, self.arrays[name] = evaluate_dispersed(self.env_id, opponent, self.eval_seed, n, self.dispersion)
         self.about[name] = {"knows": KNOWLEDGE[name]}
-        if name not in ("replan", "optimum"):
+        if name not in (*REPLANS, "optimum"):
             self.about[name]["decision_us"] = decision_us(self.env_id, opponent)
+
+    def replan(self, name: str, exhaust):
+        """Fly `Replanning` on the first flights."""
+        with guidance.Replanning(self.env_id, PROCESSES, exhaust) as replanning:
+            self.fly(name, replanning, self.solved)
+        self.about[name] |= {"solves": len(replanning.seconds), "solves_failed": replanning.failed}
+        if replanning.seconds:
+            self.about[name]["decision_us"] = 1e6 * float(np.median(replanning.seconds))
 
     def solve(self, reached=None) -> list:
         """The optima that know the draws of the first flights, to the target or to the orbits of `reached`.
@@ -209,8 +219,10 @@ def table(report: dict) -> str:
     lines.append(f"    that was reached, {flights}")
     if "bound_mass_mean_kg" in report:
         lines[-1] += f" To the target it leaves {report['bound_mass_mean_kg']:.2f} kg on average."
-    solves, failed = (competitors["replan"][key] for key in ("solves", "solves_failed"))
-    return "\n".join([*lines, f"  replan: {solves} solves, {failed} failed."])
+    for name in REPLANS:
+        solves, failed = (competitors[name][key] for key in ("solves", "solves_failed"))
+        lines.append(f"  {name}: {solves} solves, {failed} failed.")
+    return "\n".join(lines)
 
 
 def share(entry: dict, name: str, known: int) -> str:

@@ -2,13 +2,15 @@
 
     open_loop        the optimum's directions
     tvlqr            time-varying LQR about the optimum
-    Replanning       open loop through the air, then IPOPT with the nominal model from the measured state, every 20 s
+    Replanning       open loop through the air, then IPOPT from the measured state, every 20 s: with the nominal model,
+                     or with the thrust and flow that the last step's change of velocity shows
     drawn_optima     the optimum of each flight's own vehicle and air: an upper bound on the mass, not a guidance law
 
 A guidance law is `policy(obs (m, obs), t) -> action (m, 3)`, directions in ECI, as `evaluate_dispersed` flies it with
 the environment's own `action_frame="eci"`; it sees r and v without noise, as a policy does, the flight computer's mass,
 time and phase, never the draw.
-Reading order: open loop, LQR, the program of the remaining ascent, replanning, the optimum that knows the draw.
+Reading order: open loop, LQR, the program of the remaining ascent, the measured engine, replanning, the optimum that
+knows the draw.
 `comparison.py` flies, compares and prints them. CasADi is imported only where it solves.
 """
 
@@ -25,6 +27,7 @@ from common.errors import NoOptimum
 from common.ipopt import interruptible
 from common.workers import Workers
 from rocket.dispersion import draw_vehicles
+from rocket.dynamics import ascent_dynamics
 from rocket.environment import RocketVectorEnv
 from rocket.missions import ROCKETS, Mission
 from rocket.optimum import (
@@ -262,11 +265,89 @@ def optimise_remaining(rocket: Rocket, remaining: RemainingAscent, guess: dict, 
 
 
 # ---------------------------------------------------------------------------------------------------------------------
+# The engine that plans are made with: the nominal one, or what the last step's change of velocity shows of it
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def nominal_exhaust(rocket: Rocket) -> float:
+    """m/s: the exhaust velocity of the last burn, thrust over flow."""
+    burn = rocket.burns[-1]
+    return burn.thrust / burn.flow(rocket.table_isp)
+
+
+def drawn_exhaust(rocket: Rocket, dispersion: float, z) -> np.ndarray:
+    """m/s: the last burn's exhaust velocity of each of the draws z (n, k), which no flight could know."""
+    vehicles, last = draw_vehicles(rocket, dispersion, z), len(rocket.burns) - 1
+    return vehicles.thrust[last] / vehicles.flow[last]
+
+
+def engine_off(rocket: Rocket, y) -> np.ndarray:
+    """The acceleration (n, 3) of gravity and nominal drag alone at states y (n, 7) of r, v and m."""
+    return np.array(ascent_dynamics(y.T, np.zeros(5), rocket)[3:6]).T
+
+
+class NominalEngine:
+    """Mass (kg), thrust (N) and flow (kg/s) of n last stages, (n,) each: the table's and the flight computer's."""
+
+    def __init__(self, rocket: Rocket, n: int):
+        burn = rocket.burns[-1]
+        self.rocket = rocket
+        self.mass = np.zeros(n)
+        self.thrust = np.full(n, burn.thrust)
+        self.flow = np.full(n, burn.flow(rocket.table_isp))
+
+    def update(self, obs, u, is_lit):
+        """A step later: obs (n, 9), the directions u (n, 3) flown since, whether the last burn is on (n,)."""
+        self.mass = obs[:, 6]
+
+
+class MeasuredEngine(NominalEngine):
+    """The same by measurement: what a last stage has gained in velocity shows what it has burnt.
+
+    A step of the last burn adds to the velocity what gravity and drag do, and exhaust ln(m before / m after) along the
+    direction flown (Tsiolkovsky). So the ratio of the masses, flow over mass and thrust over mass follow from r, v and
+    the exhaust velocity (m/s, one or (n,)). Drag is the nominal one: where the last stage is lit little is left of it.
+    The first mass of the burn is the flight computer's, which nothing measures. What it is off by makes thrust and flow
+    wrong in the same proportion, and the directions of a plan depend on neither, but on their ratio to the mass.
+    """
+
+    def __init__(self, rocket: Rocket, exhaust, n: int):
+        super().__init__(rocket, n)
+        self.exhaust = np.broadcast_to(exhaust, n)
+        self.y = np.zeros((n, 7))  # a step ago
+        self.was_lit = np.zeros(n, dtype=bool)
+
+    def update(self, obs, u, is_lit):
+        self.mass = np.where(self.was_lit, self.mass, obs[:, 6])
+        y = np.column_stack([obs[:, :6], self.mass])
+        whole = is_lit & self.was_lit
+        if whole.any():
+            gain = ((y - self.y)[:, 3:6] - self._fall(y)) * u
+            left = np.exp(-gain.sum(axis=1) / self.exhaust)  # of the mass
+            burnt = np.where(whole, self.mass * (1 - left), 0.0)
+            self.mass = self.mass - burnt
+            self.flow = np.where(whole, burnt / self.rocket.dt, self.flow)
+            self.thrust = np.where(whole, self.flow * self.exhaust, self.thrust)
+        self.y, self.was_lit = y, is_lit
+
+    def _fall(self, y) -> np.ndarray:
+        """What gravity and drag have added to the velocity in the last step, (n, 3) m/s, by Simpson's rule."""
+        dt = self.rocket.dt
+        middle = (self.y + y) / 2
+        middle[:, :3] += (self.y - y)[:, 3:6] * dt / 8  # of the cubic through r and v at both ends
+        begin, between, end = (engine_off(self.rocket, state) for state in (self.y, middle, y))
+        return dt / 6 * (begin + 4 * between + end)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 # Replanning: closed-loop explicit guidance
 # ---------------------------------------------------------------------------------------------------------------------
 
 REPLAN_EVERY = 20.0  # s
 LAST_REPLAN = 20.0  # s before the planned cut-off, after which the last plan is flown open loop
+CHANGE = 0.03  # of the measured flow, at which a flight is replanned at once: no drawn engine differs by so much
+SHORTEST = 4.0  # s, of such a plan: a shorter one has two held directions
+LONGEST = 3.0  # times the nominal flight, of the table of directions: an engine may have lost half of its thrust
 REPLAN_INTERVALS = 8  # of collocation: 12 change the final mass by less than 1e-7 kg
 
 
@@ -278,8 +359,8 @@ def optimum_guess(env_id: str) -> dict:
 
 
 def middles(rocket: Rocket):
-    """The middles (s) of the steps of 1.5 times the longest nominal flight: some vehicles burn longer."""
-    return rocket.dt * (np.arange(np.ceil(1.5 * rocket.end_time / rocket.dt)) + 0.5)
+    """The middles (s) of the steps of `LONGEST` times the longest nominal flight: some vehicles burn longer."""
+    return rocket.dt * (np.arange(np.ceil(LONGEST * rocket.end_time / rocket.dt)) + 0.5)
 
 
 def directions_at(plan: dict, times):
@@ -307,19 +388,25 @@ def replan_one(job):
 class Replanning:
     """What launchers do, as a policy: open loop until the last stage has been lit, then explicit guidance.
 
-    Every `REPLAN_EVERY` seconds the remaining ascent is solved again, from the r, v observed and the flight computer's
-    mass, with the *nominal* thrust and flow, for the orbit of the target with the least propellant; its directions are
-    flown until the next plan, and those of the last plan until the cut-off. A launcher also measures its acceleration
-    and corrects thrust and mass by it; this one does not. Where IPOPT fails, the last plan is kept.
-    On 60 draws of eval seed 1, others than the reported ones, p95 of ||error|| was 0.00012; replanned until 30 or 40 s
-    before the cut-off 0.00014 and 0.00026, every 10 s until 10 s 0.00004, every 4 s until 10 s 0.00002.
+    Every `REPLAN_EVERY` seconds the remaining ascent is solved again from the r, v observed, for the orbit of the
+    target with the least propellant; its directions are flown until the next plan, and those of the last plan until
+    the cut-off. Where IPOPT fails, the last plan is kept.
+
+    With an `exhaust` velocity (m/s, one or one a flight) thrust, flow and mass are those of `MeasuredEngine`, as
+    launchers correct theirs by the acceleration that they measure. The last burn then ends at the latest where the
+    propellant that is left is burnt at the measured flow. Where that flow is off the plan's by `CHANGE`, an engine has
+    failed: the flight is replanned at once. Without it they are the nominal ones and the flight computer's mass.
+    On 60 draws of eval seed 1, others than the reported ones, p95 of ||error|| was 0.00012 with the nominal ones;
+    replanned until 30 or 40 s before the cut-off 0.00014 and 0.00026, every 10 s until 10 s 0.00004, every 4 s until
+    10 s 0.00002.
 
     Solves are shared out to `processes`, which changes only the time. `failed` and `seconds` (one a solve) are counted
     from its making on.
     """
 
-    def __init__(self, env_id: str, processes: int = 1):
+    def __init__(self, env_id: str, processes: int = 1, exhaust=None):
         self.rocket, self.guess, self.open_loop = ROCKETS[env_id].rocket, optimum_guess(env_id), open_loop(env_id)
+        self.exhaust = exhaust
         self.middles = middles(self.rocket)
         self.target = target_orbit(self.rocket.target, self.rocket.mu)
         self.failed, self.seconds = 0, []
@@ -334,32 +421,44 @@ class Replanning:
     def __call__(self, obs, t):
         if t == 0:
             self.plans = [self.guess] * len(obs)
+            self.ends = np.full(len(obs), self.guess["t"][-1])  # s, of the plans
             # (m, steps, 3) directions
             self.u = np.stack([self.open_loop(obs, step) for step in range(len(self.middles))], axis=1)
-        if t % round(REPLAN_EVERY / self.rocket.dt) == 0:
-            self._replan(obs, t)
+            self.engine = NominalEngine(self.rocket, len(obs))
+            if self.exhaust is not None:
+                self.engine = MeasuredEngine(self.rocket, self.exhaust, len(obs))
+            self.planned_flow = self.engine.flow.copy()
+        is_lit = obs[:, 8] >= min(len(self.rocket.burns) - 1, 1)  # the last burn
+        self.engine.update(obs, self._planned(max(t - 1, 0)), is_lit)
+        left = self.ends - self.rocket.dt * t  # s, of the plans
+        is_time = t % round(REPLAN_EVERY / self.rocket.dt) == 0
+        has_changed = np.abs(self.engine.flow / self.planned_flow - 1) > CHANGE
+        is_due = (is_time & (left > LAST_REPLAN)) | (has_changed & (left > SHORTEST))
+        self._replan(obs, t, np.flatnonzero(is_lit & is_due))
+        return self._planned(t)
+
+    def _planned(self, t):
+        """The directions (m, 3) of step t."""
         return self.u[:, min(t, len(self.middles) - 1)]
 
-    def _replan(self, obs, t):
-        """New plans from step t on for the flights of obs (m, 9) in the last burn that are not about to end it."""
+    def _replan(self, obs, t, flights):
+        """New plans from step t on for some of the flights of obs (m, 9)."""
         now = self.rocket.dt * t
-        in_last_burn = obs[:, 8] >= min(len(self.rocket.burns) - 1, 1)
-        flights = [k for k in np.flatnonzero(in_last_burn) if self.plans[k]["t"][-1] - now > LAST_REPLAN]
-        jobs = [(self.rocket, self._remaining_ascent(obs[k], now), self.plans[k]) for k in flights]
+        jobs = [(self.rocket, self._remaining_ascent(obs[k], now, k), self.plans[k]) for k in flights]
+        self.planned_flow[flights] = self.engine.flow[flights]
         for k, (plan, seconds) in zip(flights, self.workers.map(replan_one, jobs)):
             self.seconds.append(seconds)
             if plan is None:
                 self.failed += 1
                 continue
-            self.plans[k] = plan
+            self.plans[k], self.ends[k] = plan, plan["t"][-1]
             self.u[k, t:] = directions_at(plan, self.middles[t:])
 
-    def _remaining_ascent(self, obs, now: float) -> RemainingAscent:
-        """What is left of the last burn at `now` (s) of a flight of obs (9,), with the nominal thrust and flow."""
-        burn, mass = self.rocket.burns[-1], obs[6]
-        flow = burn.flow(self.rocket.table_isp)
+    def _remaining_ascent(self, obs, now: float, k: int) -> RemainingAscent:
+        """What is left of the last burn at `now` (s) of flight k, of obs (9,)."""
+        mass, thrust, flow = self.engine.mass[k], self.engine.thrust[k], self.engine.flow[k]
         burn_out = now + (mass - self.rocket.dry_mass) / flow
-        end, thrust, flow, mass = (np.array([value]) for value in (burn_out, burn.thrust, flow, mass))
+        end, thrust, flow, mass = (np.array([value]) for value in (burn_out, thrust, flow, mass))
         return RemainingAscent(now, obs[:6], end, thrust, flow, mass, *self.target)
 
 
