@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from common.errors import refuse_unless
+from rocket.failure import Losses, drawn_losses, largest_failures, no_losses
 from rocket.vehicle import ROCKET, Rocket, engine_groups, engine_types
 
 
@@ -39,18 +40,24 @@ WIND_ALTITUDE, WIND_DEPTH = 12e3, 5e3  # m, of the profile exp(-((h - altitude) 
 
 
 class Vehicles(NamedTuple):
-    """N vehicles as they were drawn, arcs as in `Rocket.arcs` (A of them): what is constant between events."""
+    """N vehicles as they were drawn, arcs as in `Rocket.arcs` (A of them): what is constant between events.
+
+    Where failures are drawn there is one arc more: the strike cuts a burn in two, that of a healthy flight never comes.
+    """
 
     mass: np.ndarray  # (N,) kg at lift-off
     dry_mass: np.ndarray  # (N,) kg, as `Rocket.dry_mass`
     propellant: np.ndarray  # (N,) kg in the last stage
-    end: np.ndarray  # (A, N) s, the last infinite; the first ones are the ends of all burns but the last
+    burn_end: np.ndarray  # (burns, N) s, of the last when it runs dry
+    burn: np.ndarray  # (A, N) the burn of each arc, from 0
+    end: np.ndarray  # (A, N) s, the last infinite
     thrust: np.ndarray  # (A, N) N
     flow: np.ndarray  # (A, N) kg/s
     dropped: np.ndarray  # (A, N) kg at the arc's end
     burn_out: np.ndarray  # (N,) s: when the last stage has burnt what the nominal one burns, or runs dry
     wind: np.ndarray  # (2, N) m/s, towards east and north where the profile of `wind_velocity` is 1
     drag: np.ndarray  # (N,) factor on the drag
+    failure: np.ndarray  # (3, N) burn, moment (s) and share lost; of a healthy flight -1, 0, 0
 
 
 def draw_names(rocket: Rocket) -> tuple[str, ...]:
@@ -77,12 +84,19 @@ def draw_bounds(rocket: Rocket, dispersion: float) -> np.ndarray:
     return np.minimum(bounds, np.divide(LARGEST_CHANGE * nominal, sigmas, out=bounds.copy(), where=sigmas > 0))
 
 
-def largest_draw(rocket: Rocket, dispersion: float) -> np.ndarray:
-    """(1, k): the draw of the vehicle that burns longest and is heaviest."""
+def largest_draw(rocket: Rocket, dispersion: float, failure_time: str = "") -> np.ndarray:
+    """(1, k): the draw of the vehicle that burns longest and is heaviest.
+
+    With a `failure_time` (F, k + 4), one of which burns longest: a row for each group of engines that may fail.
+    """
     types = len(engine_types(rocket))
     signs = np.zeros(len(draw_names(rocket)))
     signs[:types], signs[2 * types : 4 * types + 1] = -1.0, 1.0
-    return (signs * draw_bounds(rocket, dispersion))[None]
+    largest = (signs * draw_bounds(rocket, dispersion))[None]
+    if not failure_time:
+        return largest
+    failures = largest_failures(rocket, failure_time)
+    return np.hstack([np.repeat(largest, len(failures), axis=0), failures])
 
 
 class Factors(NamedTuple):
@@ -115,14 +129,20 @@ def draw_factors(rocket: Rocket, dispersion: float, draw: np.ndarray) -> Factors
     return Factors(*of_engines, drag=value[-3], payload=value[-4], wind=value[-2:])
 
 
-def draw_vehicles(rocket: Rocket, dispersion: float, draw: np.ndarray) -> Vehicles:
+def draw_vehicles(
+    rocket: Rocket, dispersion: float, draw: np.ndarray, failure: float = 0.0, failure_time: str = "random"
+) -> Vehicles:
     """The vehicles of N draws (N, k): each value is the nominal one changed by dispersion times sigma times score.
 
     Arcs are the burns, and a last one without thrust. What is loaded is burnt or dropped, also what an engine keeps
-    that uses a part of its propellant. Raises BadInput for a draw that no vehicle can have.
+    that uses a part of its propellant. With a `failure` a draw may be (N, k + 4), the last four as in `FAILURE_DRAW`;
+    without them a flight is healthy. Raises BadInput for a draw that no vehicle can have.
     """
-    factors = draw_factors(rocket, dispersion, np.asarray(draw, dtype=np.float64))
-    type_of = {engine: j for j, engine in enumerate(engine_types(rocket))}
+    draw = np.asarray(draw, dtype=np.float64)
+    scores = len(draw_names(rocket))
+    factors = draw_factors(rocket, dispersion, draw[:, :scores])
+    groups, types = engine_groups(rocket), engine_types(rocket)
+    type_of = {engine: j for j, engine in enumerate(types)}
     none = np.zeros_like(factors.payload)
 
     def empty(parts):
@@ -131,49 +151,101 @@ def draw_vehicles(rocket: Rocket, dispersion: float, draw: np.ndarray) -> Vehicl
     def loaded(parts):
         return sum(n * e.propellant * factors.propellant[type_of[e]] for n, e in parts)
 
-    def thrust(burn):
-        return sum(n * e.thrust * factors.burn_rate[type_of[e]] * factors.isp[type_of[e]] for n, e in burn.engines)
+    def thrust(parts):
+        return sum(n * e.thrust * factors.burn_rate[type_of[e]] * factors.isp[type_of[e]] for n, e in parts)
 
-    def flow(burn):
-        return sum(n * e.flow(rocket.table_isp) * factors.burn_rate[type_of[e]] for n, e in burn.engines)
+    def flow(parts):
+        return sum(n * e.flow(rocket.table_isp) * factors.burn_rate[type_of[e]] for n, e in parts)
 
-    end, burn_out, seconds_lit = burn_ends(rocket, factors.propellant / factors.burn_rate)
+    lasting = factors.propellant / factors.burn_rate
+    losses = no_losses(groups, len(none))
+    if failure and draw.shape[1] > scores:
+        _, _, seconds_lit = burn_ends(rocket, lasting, losses)
+        losses = drawn_losses(rocket, draw[:, scores:], failure, failure_time, seconds_lit)
+    end, burn_out, seconds_lit = burn_ends(rocket, lasting, losses)
     dropped = np.zeros_like(end)
-    for group, seconds in zip(engine_groups(rocket), seconds_lit):
+    for g, (group, seconds) in enumerate(zip(groups, seconds_lit)):
         if group.dropped_after < len(rocket.burns) - 1:
-            burnt = group.engine.flow(rocket.table_isp) * factors.burn_rate[group.type] * seconds
+            rate = group.engine.flow(rocket.table_isp) * factors.burn_rate[group.type]
+            burnt = rate * losses.spent(g, seconds)
             unburnt = np.maximum(group.engine.propellant * factors.propellant[group.type] - burnt, 0.0)
             dropped[group.dropped_after] += empty([(group.number, group.engine)]) + group.number * unburnt
 
     last = rocket.burns[-1].engines
     aboard = [*(part for burn in rocket.burns for part in burn.dropped), *last]
-    return Vehicles(
+    vehicles = Vehicles(
         mass=factors.payload + empty(aboard) + loaded(aboard),
         dry_mass=factors.payload + empty(last),
         propellant=none + loaded(last),
+        burn_end=end,
+        burn=np.tile(arc_burns(rocket, len(end) + 1)[:, None], len(none)),
         end=np.vstack([end, none + np.inf]),
-        thrust=np.array([*(none + thrust(burn) for burn in rocket.burns), none]),
-        flow=np.array([*(none + flow(burn) for burn in rocket.burns), none]),
+        thrust=np.array([*(none + thrust(burn.engines) for burn in rocket.burns), none]),
+        flow=np.array([*(none + flow(burn.engines) for burn in rocket.burns), none]),
         dropped=np.vstack([dropped, none]),
         burn_out=burn_out,
         wind=factors.wind,
         drag=factors.drag,
+        failure=np.tile([[-1.0], [0.0], [0.0]], len(none)),
+    )
+    if not failure:
+        return vehicles
+    whole = [[(group.number, group.engine)] for group in groups]
+    of_groups = (np.array([none + of(parts) for parts in whole]) for of in (thrust, flow))
+    return struck(vehicles, groups, losses, losses.strike(groups, end, seconds_lit), *of_groups)
+
+
+def struck(vehicles: Vehicles, groups, losses: Losses, strike: np.ndarray, thrust: np.ndarray, flow: np.ndarray):
+    """Healthy vehicles whose burns are cut where a failure strikes (N,) s, with the thrust and flow that are left.
+
+    thrust, flow (G, N): those of each group of engines. A strike that is infinite never comes.
+    """
+    last_arc = len(vehicles.end) - 1
+    cut = (vehicles.end <= strike).sum(axis=0)  # the arc that the strike ends
+    arcs = np.arange(last_arc + 2)[:, None]
+    after = arcs > cut
+    source = np.minimum(arcs - after, last_arc)  # which of the healthy flight's arcs it is of
+
+    def of_arcs(column):
+        return np.take_along_axis(column, source, axis=0)
+
+    def left(column, of_groups):
+        lost = np.zeros_like(column)
+        for group, share, full in zip(groups, losses.share, of_groups):
+            lost[list(group.burns)] += share * full
+        return of_arcs(column) - after * of_arcs(lost)
+
+    has_failed = np.isfinite(strike)
+    failure = [np.isfinite(losses.after).argmax(axis=0), strike, losses.share.max(axis=0)]
+    return vehicles._replace(
+        burn=of_arcs(vehicles.burn),
+        end=np.sort(np.vstack([vehicles.end, strike]), axis=0),
+        thrust=left(vehicles.thrust, thrust),
+        flow=left(vehicles.flow, flow),
+        dropped=of_arcs(vehicles.dropped) * (arcs != cut),
+        failure=np.where(has_failed, failure, vehicles.failure),
     )
 
 
-def burn_ends(rocket: Rocket, lasting: np.ndarray):
+def arc_burns(rocket: Rocket, arcs: int) -> np.ndarray:
+    """The burn of each arc (arcs,): what follows the last burn counts as part of it."""
+    return np.minimum(np.arange(arcs), len(rocket.burns) - 1)
+
+
+def burn_ends(rocket: Rocket, lasting: np.ndarray, losses: Losses):
     """Ends of the burns (B, N) s, the last one's when it runs dry; `burn_out` (N,) s; seconds lit of the groups (G, N).
 
     lasting (types, N): how long an engine's propellant lasts, as a part of the nominal time. A burn that drops burning
     engines ends when the first of them has burnt as large a part of its propellant as nominally, a coast
-    after its nominal length, any other at its nominal time, and none goes on without an engine's propellant.
+    after its nominal length, any other at its nominal time, and none goes on without an engine's propellant. Engines
+    that lose thrust and flow burn the same for longer.
     """
     groups, last = engine_groups(rocket), len(rocket.burns) - 1
     start = burn_out = np.zeros(lasting.shape[1])
     seconds_lit = np.zeros((len(groups), lasting.shape[1]))
     ends = []
     for k, burn in enumerate(rocket.burns):
-        until_empty, until_due = seconds_left(groups, k, lasting, seconds_lit)
+        until_empty, until_due = seconds_left(groups, k, lasting, seconds_lit, losses)
         planned = burn.end - (rocket.burns[k - 1].end if burn.is_coast else start)  # a coast keeps its length
         until_due = np.where(np.isfinite(until_due), until_due, planned)
         burn_out = start + np.maximum(np.minimum(until_due, until_empty), 0.0)
@@ -186,27 +258,41 @@ def burn_ends(rocket: Rocket, lasting: np.ndarray):
     return np.array(ends), burn_out, seconds_lit
 
 
-def seconds_left(groups, k: int, lasting: np.ndarray, seconds_lit: np.ndarray):
+def seconds_left(groups, k: int, lasting: np.ndarray, seconds_lit: np.ndarray, losses: Losses):
     """From the beginning of burn k on: s until the first engine is empty, and until the first that leaves then is due.
 
     (N,) each, infinite where there is none. An engine is due when it has burnt its nominal part of its propellant.
     """
     until_empty = until_due = np.full(lasting.shape[1], np.inf)
-    for group, seconds in zip(groups, seconds_lit):
+    for g, (group, seconds) in enumerate(zip(groups, seconds_lit)):
         if k not in group.burns or group.seconds_full == np.inf:
             continue
-        until_empty = np.minimum(until_empty, group.seconds_full * lasting[group.type] - seconds)
+        until_empty = np.minimum(until_empty, losses.lasts(g, group.seconds_full * lasting[group.type]) - seconds)
         if k == group.dropped_after:
-            until_due = np.minimum(until_due, group.seconds_lit * lasting[group.type] - seconds)
+            until_due = np.minimum(until_due, losses.lasts(g, group.seconds_lit * lasting[group.type]) - seconds)
     return until_empty, until_due
 
 
 def nominal_vehicles(rocket: Rocket, number: int) -> Vehicles:
     """`number` vehicles just as the table has them; what a stage has not burnt (`table_isp`) stays on board."""
     _, end, thrust, flow, dropped = np.array(rocket.arcs()).T
-    numbers = [rocket.x0[6], rocket.dry_mass, sum(n * engine.propellant for n, engine in rocket.burns[-1].engines)]
-    columns = [*numbers, np.append(end[:-1], np.inf), thrust, flow, dropped, rocket.burns[-1].end, np.zeros(2), 1.0]
-    return Vehicles(*(np.repeat(np.asarray(column)[..., None], number, axis=-1) for column in columns))
+    values = {
+        "mass": rocket.x0[6],
+        "dry_mass": rocket.dry_mass,
+        "propellant": sum(n * engine.propellant for n, engine in rocket.burns[-1].engines),
+        "burn_end": [burn.end for burn in rocket.burns],
+        "burn": arc_burns(rocket, len(end)),
+        "end": np.append(end[:-1], np.inf),
+        "thrust": thrust,
+        "flow": flow,
+        "dropped": dropped,
+        "burn_out": rocket.burns[-1].end,
+        "wind": np.zeros(2),
+        "drag": 1.0,
+        "failure": [-1.0, 0.0, 0.0],
+    }
+    columns = {name: np.asarray(value)[..., None] for name, value in values.items()}
+    return Vehicles(**{name: np.repeat(column, number, axis=-1) for name, column in columns.items()})
 
 
 def wind_velocity(place, wind, rocket: Rocket = ROCKET):

@@ -1,4 +1,4 @@
-"""The rockets' environment: time grid, events, RK4, cut-off, dispersed vehicles; and how an id is registered."""
+"""The rockets' environment: time grid, events, RK4, cut-off, vehicles that differ; and how an id is registered."""
 
 from __future__ import annotations
 
@@ -27,6 +27,7 @@ from rocket.dispersion import (
     nominal_vehicles,
 )
 from rocket.dynamics import ascent_dynamics
+from rocket.failure import FAILURE_DRAW, HEALTHY_DRAW, check_failure, failure_scores
 from rocket.missions import PAPER_MISSION, ROCKETS, Mission
 from rocket.orbits import (
     local_frame,
@@ -92,17 +93,24 @@ class RocketVectorEnv(BatchedEnv):
     nominal schedule from the last staging on; `observe_mass` shows the true one. `observe_draw` puts the scores behind
     the nine.
 
+    With `failure` K > 0 (cut-off alone) half of the episodes have a hidden loss of thrust: one group of engines loses a
+    share of thrust and flow, uniform from 0 to K, from a uniformly random moment of its burn on, or with `failure_time`
+    "ignition" the last stage from its ignition on (`failure.py`). A draw then has four numbers more, from 0 to 1, named
+    by `FAILURE_DRAW`; one of k scores alone is a healthy flight's. No observation shows them.
+
     With a `cutoff` mission (ours: the paper fixes the final time) the engine stops when, in the last phase, the energy
     reaches the target's: the root within the step, to 1e-10, ends the episode.
 
-    Every flight also ends below altitude 0 (a crash), and at `end_time`. With cut-off and dispersion the burn-out of
-    its own last stage takes the place of `end_time` (t_norm may end below 0), unless `end_time` was changed or is not
-    the last burn's end.
+    Every flight also ends below altitude 0 (a crash), and at `end_time`. With cut-off, and dispersion or failures, the
+    burn-out of its own last stage takes the place of `end_time` (t_norm may end below 0), unless `end_time` was changed
+    or is not the last burn's end.
 
     Reward: the sum of the five parts R_orbital, R_trajectory, R_guidance, R_penalties and R_terminal, each a function
     of `rewards.py`. `final_info`, (N,) each: `error_norm` (and `error` (N, 6), the terminal error in ECI), `a_km e
     i_deg raan_deg argp_deg final_mass_kg final_time_s max_altitude_km` (at the steps' ends), the parts' sums,
-    `episodic_return`, `points` (`precision_points`), `crashed`; with dispersion `draw` (N, k) and `dry`, out of fuel.
+    `episodic_return`, `points` (`precision_points`), `crashed`; with dispersion or failures `draw` (N, k) and `dry`,
+    out of fuel; with failures `failure` (N, 3): group of engines, moment (s) and share lost, of a healthy flight
+    -1, 0, 0.
 
     Attributes for training alone, to be set before a `reset`: `guidance` (whether R_guidance is charged),
     `flights_per_start` (`BatchedEnv`; of each draw of a `reset`) and `terminal_scale`, a curriculum: the *reward* pays
@@ -125,14 +133,18 @@ class RocketVectorEnv(BatchedEnv):
         dispersion: float = 0.0,
         observe_draw: bool = False,
         observe_mass: bool = False,
+        failure: float = 0.0,
+        failure_time: str = "random",
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
     ):
         if action_frame not in ACTION_FRAMES:
             raise ValueError(f"action_frame is {action_frame!r}; it must be one of {', '.join(ACTION_FRAMES)}")
         number = isinstance(dispersion, int | float | np.number) and 0 <= dispersion <= LARGEST_DISPERSION
         refuse_unless(number, "dispersion", dispersion, f"must be a number from 0 to {LARGEST_DISPERSION:.0f}")
+        check_failure(failure, failure_time, mission.cutoff)
         self.mission = flown_mission(mission, table_isp=table_isp)
-        if dispersion:
+        self.has_draws = bool(dispersion or failure)  # whether flights differ from the table and from one another
+        if self.has_draws:
             check_drawable(self.mission.rocket)
         self.rocket, self.cutoff = self.mission.rocket, mission.cutoff
         self._last_phase = len(self.rocket.burns) - 1
@@ -140,6 +152,7 @@ class RocketVectorEnv(BatchedEnv):
         self._has_coasts = bool(self._coasts.any())
         self.action_frame, self.observe_phase = action_frame, observe_phase
         self.dispersion, self.observe_draw, self.observe_mass = dispersion, observe_draw, observe_mass
+        self.failure, self.failure_time = failure, failure_time
         self.mass_weight, self.trajectory_weight, self.guidance_weight, self.guidance = 0.0, 0.0, 0.1, False
         self.terminal_scale = TERMINAL_SCALE
         super().__init__(num_envs, 1, *self._spaces(), render_mode, autoreset_mode)
@@ -159,27 +172,39 @@ class RocketVectorEnv(BatchedEnv):
 
     def _build(self):
         """The vehicles: all alike until an episode draws its own."""
+        self._scores_drawn = len(draw_names(self.rocket))
+        self.draw = np.zeros((self.num_envs, self._scores_drawn))
         self.vehicles = nominal_vehicles(self.rocket, self.num_envs)
-        self.draw = np.zeros((self.num_envs, len(draw_names(self.rocket))))
-        if self.dispersion:
-            self.vehicles = draw_vehicles(self.rocket, self.dispersion, self.draw)
-            # of the flight computer: by burn the nominal mass at its beginning and the flow
-            ends, flow, dropped = (getattr(self.vehicles, name)[:-1, 0] for name in ("end", "flow", "dropped"))
-            burnt = flow[:-1] * np.diff(ends[:-1], prepend=0.0)
-            self._seen_mass = self.vehicles.mass[0] - np.append(0.0, np.cumsum(burnt + dropped[:-1]))
-            self._seen_flow = flow.copy()  # drawn flows will be written where it lies
+        if not self.has_draws:
+            return
+        # of the flight computer: by burn the nominal mass at its beginning and the flow
+        nominal = draw_vehicles(self.rocket, self.dispersion, self.draw)
+        ends, flow, dropped = (getattr(nominal, name)[:-1, 0] for name in ("end", "flow", "dropped"))
+        burnt = flow[:-1] * np.diff(ends[:-1], prepend=0.0)
+        self._seen_mass = nominal.mass[0] - np.append(0.0, np.cumsum(burnt + dropped[:-1]))
+        self._seen_flow = flow
+        if self.failure:
+            self.draw = np.hstack([self.draw, np.tile(HEALTHY_DRAW, (self.num_envs, 1))])
+        self.vehicles = self._drawn(self.draw)
+
+    def _drawn(self, draw):
+        """The vehicles of draws."""
+        return draw_vehicles(self.rocket, self.dispersion, draw, self.failure, self.failure_time)
 
     def _spaces(self):
         """The spaces of one environment, which hold all that may be drawn."""
         self._draw_bounds, self._largest = draw_bounds(self.rocket, self.dispersion), nominal_vehicles(self.rocket, 1)
-        if self.dispersion:
-            self._largest = draw_vehicles(self.rocket, self.dispersion, largest_draw(self.rocket, self.dispersion))
-        r_max, v_max = reachable(self.rocket, self.dispersion)
+        if self.has_draws:
+            failure_time = self.failure_time if self.failure else ""
+            self._largest = self._drawn(largest_draw(self.rocket, self.dispersion, failure_time))
+        latest = self.rocket.end_time
+        if self.has_draws:
+            latest = max(self._largest.burn_out.max(), latest)
+        r_max, v_max = reachable(self.rocket, self.dispersion, latest)
         scores = self._draw_bounds if self.observe_draw else []
-        latest = max(self._largest.burn_out.max(), self.rocket.end_time)
         high = np.array([*[r_max] * 3, *[v_max] * 3, self._largest.mass[0], 1.0, 1.0, *scores])
         low = -high
-        low[6:9] = 0.0, min(0.0, 1 - latest / self.rocket.end_time) if self.dispersion else 0.0, 0.0
+        low[6:9] = 0.0, min(0.0, 1 - latest / self.rocket.end_time), 0.0
         return Box(low, high, dtype=np.float64), Box(-1.0, 1.0, (3,), dtype=np.float64)
 
     @property
@@ -193,27 +218,27 @@ class RocketVectorEnv(BatchedEnv):
             raise ValueError(f"end_time is {value} s; it must be positive and at most {self.rocket.end_time}")
         self._end_time = float(value)
         self.episode_steps = int(self._set_ends(self._largest).max())
-        # without dispersion all flights share their steps, worked out here for the one vehicle
+        # where nothing is drawn all flights share their steps, worked out here for the one vehicle
         self._table = None
-        if not self.dispersion:
+        if not self.has_draws:
             *clock, arc = self._work_out(np.arange(self.episode_steps + 1), self._largest)
             self._table = np.array(clock), arc
         self._set_ends(self.vehicles)
 
     def _set_ends(self, vehicles):
         """When the episodes of these vehicles end at the latest: sets and returns the number of their steps."""
-        own = self.dispersion and self.cutoff and self._end_time == self.rocket.end_time == self.rocket.burns[-1].end
+        own = self.has_draws and self.cutoff and self._end_time == self.rocket.end_time == self.rocket.burns[-1].end
         self._latest = vehicles.burn_out if own else np.full(len(vehicles.mass), self._end_time)  # s
         self._steps = np.maximum(np.ceil(self._latest / self.rocket.dt - 1e-9), 1.0).astype(np.int64)
         return self._steps
 
     def _start(self, mask, options):
-        if options and not (self.dispersion and options.keys() == {"draw"}):
-            allowed = "the only one is 'draw'" if self.dispersion else "without dispersion a rocket has no options"
+        if options and not (self.has_draws and options.keys() == {"draw"}):
+            allowed = "the only one is 'draw'" if self.has_draws else "without dispersion a rocket has no options"
             raise BadInput(f"reset options are {options!r}; {allowed}")
         if not 0 < self.terminal_scale < np.inf:
             raise ValueError(f"terminal_scale is {self.terminal_scale}; it must be positive and finite")
-        if self.dispersion:
+        if self.has_draws:
             self._launch(mask, options.get("draw"))
         self.y[:, mask] = self.rocket.x0[:, None]
         self.y[6, mask] = self.vehicles.mass[mask]
@@ -227,34 +252,50 @@ class RocketVectorEnv(BatchedEnv):
 
         New ones are `flights_per_start` environments' each, in the order of those in `mask`.
         """
-        if given is None:
-            draw = np.clip(self._draw_starts(self._scores, int(mask.sum())), -self._draw_bounds, self._draw_bounds)
-        else:
-            draw = self._checked_draw(given)[mask]
-        drawn = draw_vehicles(self.rocket, self.dispersion, draw)  # before anything is changed: it may be refused
+        draw = self._draw_starts(self._scores, int(mask.sum())) if given is None else self._checked_draw(given)[mask]
+        drawn = self._drawn(draw)  # before anything is changed: it may be refused
         self.draw[mask] = draw
         for mine, new in zip(self.vehicles, drawn):
             mine[..., mask] = new
         self.episode_steps = max(self.episode_steps, int(self._set_ends(self.vehicles).max()))
 
     def _scores(self, n):
-        """Standard scores (n, k). Those of groups come in pairs, z and -z: few draws then have no mean of their own."""
-        size = self.draw.shape[1]
-        if self.flights_per_start == 1:
-            return self.np_random.standard_normal((n, size))
-        half = self.np_random.standard_normal((-(-n // 2), size))
-        return np.stack([half, -half], axis=1).reshape(-1, size)[:n]
+        """Draws (n, k). Those of groups come in pairs, z and -z: few draws then have no mean of their own."""
+        in_pairs = self.flights_per_start > 1
+        if in_pairs:
+            half = self.np_random.standard_normal((-(-n // 2), self._scores_drawn))
+            scores = np.stack([half, -half], axis=1).reshape(-1, self._scores_drawn)[:n]
+        else:
+            scores = self.np_random.standard_normal((n, self._scores_drawn))
+        scores = np.clip(scores, -self._draw_bounds, self._draw_bounds)
+        if not self.failure:
+            return scores
+        return np.hstack([scores, failure_scores(self.np_random, n, in_pairs)])
 
     def _checked_draw(self, given):
-        """The draws of `reset` (N, k), float64; BadInput where they are none."""
-        allowed = f"must hold finite numbers, of shape {self.draw.shape}: {', '.join(draw_names(self.rocket))}"
+        """The draws of `reset` (N, k), float64, with a healthy flight's where they hold no failure.
+
+        BadInput where they are none.
+        """
+        widths = [self._scores_drawn, self.draw.shape[1]]
+        shapes = " or ".join(str((self.num_envs, width)) for width in dict.fromkeys(widths))
+        names = [*draw_names(self.rocket), *(FAILURE_DRAW if self.failure else ())]
+        allowed = f"must hold finite numbers, of shape {shapes}: {', '.join(names)}"
         try:
             draw = np.array(given, dtype=np.float64)
         except (TypeError, ValueError):
             draw = np.empty(0)
-        refuse_unless(draw.shape == self.draw.shape, "options['draw']", f"of shape {draw.shape}", allowed)
+        fits = draw.shape in [(self.num_envs, width) for width in widths]
+        refuse_unless(fits, "options['draw']", f"of shape {draw.shape}", allowed)
         bad = draw[~np.isfinite(draw)]
         refuse_unless(not len(bad), "an entry of options['draw']", bad[:1].sum(), allowed)
+        if not self.failure:
+            return draw
+        if draw.shape != self.draw.shape:
+            return np.hstack([draw, np.tile(HEALTHY_DRAW, (self.num_envs, 1))])
+        for name, column in zip(FAILURE_DRAW, draw.T[self._scores_drawn :]):
+            outside = column[(column < 0) | (column > 1)]
+            refuse_unless(not len(outside), f"{name} of options['draw']", outside[:1].sum(), "must be from 0 to 1")
         return draw
 
     def _progress(self):
@@ -267,8 +308,8 @@ class RocketVectorEnv(BatchedEnv):
         obs = np.empty((self.num_envs, *self.single_observation_space.shape))
         obs[:, :7] = self.y.T
         if self.observe_draw:
-            obs[:, 9:] = self.draw
-        if self.dispersion and not self.observe_mass:
+            obs[:, 9:] = self.draw[:, : self._scores_drawn]
+        if self.has_draws and not self.observe_mass:
             obs[:, 6] = self._computed_mass()
         phi = self._schedule().phi
         obs[:, 7] = (1 - self.time / self.rocket.end_time) * self.observe_phase
@@ -283,7 +324,7 @@ class RocketVectorEnv(BatchedEnv):
     @property
     def phase(self) -> np.ndarray:
         """The 0-based phase (N,) in which the running steps begin: a burn is a phase."""
-        return np.minimum(self._schedule().arc, self._last_phase)
+        return self.vehicles.burn[self._schedule().arc, self._everyone]
 
     def _schedule(self) -> Schedule:
         """Of the running steps."""
@@ -299,13 +340,14 @@ class RocketVectorEnv(BatchedEnv):
         begin = np.where(t >= self._steps, self._latest, dt * t)
         end = np.where(t + 1 >= self._steps, self._latest, dt * (t + 1))
         arc = (ends <= dt * np.minimum(t, self._steps - 1)).sum(axis=0)
-        phi = np.minimum(arc, self._last_phase) / max(self._last_phase, 1)
+        phi = vehicles.burn[arc, np.arange(vehicles.burn.shape[1])] / max(self._last_phase, 1)
         return Schedule(begin, end, phi, arc)
 
     def _computed_mass(self):
         """The flight computer's mass (N,) in kg: the nominal burn's, counted from the staging that has just been."""
-        burn = (self.vehicles.end[: self._last_phase] <= self.time).sum(axis=0)
-        began = np.where(burn > 0, self.vehicles.end[burn - 1, self._everyone], 0.0)
+        ends = self.vehicles.burn_end
+        burn = (ends[: self._last_phase] <= self.time).sum(axis=0)
+        began = np.where(burn > 0, ends[burn - 1, self._everyone], 0.0)
         return np.maximum(self._seen_mass[burn] - self._seen_flow[burn] * (self.time - began), self.rocket.dry_mass)
 
     def _directions(self, actions):
@@ -324,7 +366,7 @@ class RocketVectorEnv(BatchedEnv):
     def _advance(self, actions):
         t, u, before = self.t, self._directions(actions), self.y
         begin, end, _, arc = self._schedule()
-        duration, phase, done = end - begin, np.minimum(arc, self._last_phase), t + 1 == self._steps
+        duration, phase, done = end - begin, self.vehicles.burn[arc, self._everyone], t + 1 == self._steps
         steps = Steps(u, begin, end, self._everyone, arc)
         self.y = self._fly(before, steps, duration)
         if self.cutoff:
@@ -464,8 +506,10 @@ class RocketVectorEnv(BatchedEnv):
         info |= {f"{name}_deg": np.degrees(getattr(elements, name)) for name in ("i", "raan", "argp")}
         info |= {"final_mass_kg": self.y[6].copy(), "final_time_s": self.time.copy(), "crashed": self._crashed.copy()}
         info |= {"max_altitude_km": self._max_altitude / 1e3, "points": precision_points(error_norm)}
-        if self.dispersion:
+        if self.has_draws:
             info |= {"draw": self.draw.copy(), "dry": self.time >= self.vehicles.burn_out - 1e-6}
+        if self.failure:
+            info["failure"] = self.vehicles.failure.T.copy()
         return info | dict(zip(self.PARTS, self._parts.copy())) | {"episodic_return": self._parts.sum(axis=0)}
 
     def _snapshot(self):
@@ -475,17 +519,17 @@ class RocketVectorEnv(BatchedEnv):
         # Matplotlib takes a quarter of a second that only a picture should cost
         from rocket.animation import AscentSheet
 
-        title = "Rocket ascent, nominal stagings marked" if self.dispersion else "Rocket ascent"
+        title = "Rocket ascent, nominal stagings marked" if self.has_draws else "Rocket ascent"
         return AscentSheet(self.rocket, title)
 
 
-def reachable(rocket: Rocket, dispersion: float = 0.0) -> tuple[float, float]:
-    """Bounds of |r| (m) and |v| (m/s): the launcher's delta-v and gravity all pointing one way, the whole flight.
+def reachable(rocket: Rocket, dispersion: float, end: float) -> tuple[float, float]:
+    """Bounds of |r| (m) and |v| (m/s): the launcher's delta-v and gravity all pointing one way, until the `end` (s).
 
     With dispersion the delta-v is bounded by one stage's with the fastest exhaust, the heaviest start and the lightest
     end.
     """
-    gain, end = delta_v(rocket), rocket.end_time
+    gain = delta_v(rocket)
     if dispersion:
         draw = largest_draw(rocket, dispersion)
         scores = dict(zip(draw_names(rocket), draw_bounds(rocket, dispersion)))
@@ -494,7 +538,6 @@ def reachable(rocket: Rocket, dispersion: float = 0.0) -> tuple[float, float]:
         fastest = max((thrust / flow for thrust, flow in engines if flow), default=0.0)
         gain = fastest * (1 + dispersion * DISPERSION.isp * scores["isp_1"])
         gain *= np.log(heavy.mass[0] / light.dry_mass[0])
-        end = max(end, heavy.burn_out[0])
     v_max = np.linalg.norm(rocket.x0[3:6]) + gain + rocket.mu / rocket.Re**2 * end
     return float(rocket.Re + v_max * end), float(v_max)
 
@@ -509,7 +552,7 @@ class RocketEnv(SingleEnv):
     end_time = of_batch("end_time", "Seconds after which an episode ends at the latest.")
     terminal_scale = of_batch("terminal_scale", "The scale of R_terminal in the reward; reports keep TERMINAL_SCALE.")
     draw = property(
-        lambda self: self.batch.draw, doc="The running episode's standard scores (1, k), zeros without dispersion."
+        lambda self: self.batch.draw, doc="The running episode's draw (1, k), zeros where nothing is drawn."
     )
 
 
@@ -534,7 +577,7 @@ def make_rocket(env_id: str, **options) -> RocketEnv:
 def fly_rocket(env_id: str, policy: Callable, end_time: float | None = None, draw=None, **options) -> dict:
     """Fly `policy(obs (1, obs), t) -> action (1, 3)` once, to `end_time` (s) at the latest, and record what happened.
 
-    draw (k,): the vehicle's standard scores, with the option `dispersion`.
+    draw (k,): the vehicle's standard scores and its failure, with the options `dispersion` and `failure`.
 
     Returns t (K+1,) s, u (K, 3) the unit directions in ECI, y (K+1, 7) r, v, m, reward (K,), and the last step's info.
     """

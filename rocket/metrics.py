@@ -1,7 +1,8 @@
-"""What a rocket's flights are measured by: elements, altitudes, mass; and statistics of dispersed flights.
+"""What a rocket's flights are measured by: elements, altitudes, mass; and statistics of flights that differ.
 
 One start and a deterministic policy: one nominal flight says everything. Dispersed flights have each its own vehicle
-and air, so that a policy is measured by statistics. The names of all metrics (eval.json) are the project's interface.
+and air, some a failure, so that a policy is measured by statistics. The names of all metrics (eval.json) are the
+project's interface.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import numpy as np
 
 from rocket.dispersion import draw_bounds
 from rocket.environment import RocketVectorEnv, fly_rocket
+from rocket.failure import failure_scores
 from rocket.missions import ROCKETS, Mission
 from rocket.orbits import orbital_elements
 from rocket.vehicle import Rocket
@@ -97,28 +99,48 @@ AT_ONCE = 341  # flights of a batch: a fifth, so that the caches of a policy sta
 BOX = {"perigee_km": 10.0, "apogee_km": 500.0, "i_deg": 0.1, "raan_deg": 0.1, "argp_deg": 0.3}
 
 
-def draws(rocket: Rocket, dispersion: float, eval_seed: int, n: int) -> np.ndarray:
+def draws(rocket: Rocket, dispersion: float, eval_seed: int, n: int, failure: float = 0.0) -> np.ndarray:
     """The n draws (n, k) of a seed, standard scores: the same for every policy and guidance law.
 
-    Clipped as the environment's own: at 3, earlier where a dispersion is so large that no such vehicle can be.
+    Clipped as the environment's own: at 3, earlier where a dispersion is so large that no such vehicle can be. With a
+    `failure` (n, k + 4): behind the same scores the flights' failures, the same ones whatever its size.
     """
     bounds = draw_bounds(rocket, dispersion)
-    return np.random.default_rng([eval_seed, 2]).standard_normal((n, len(bounds))).clip(-bounds, bounds)
+    scores = np.random.default_rng([eval_seed, 2]).standard_normal((n, len(bounds))).clip(-bounds, bounds)
+    if not failure:
+        return scores
+    return np.hstack([scores, failure_scores(np.random.default_rng([eval_seed, 4]), n)])
+
+
+def healthy(arrays: dict) -> np.ndarray:
+    """Which of the flights of `evaluate_dispersed`'s arrays have no failure, (n,)."""
+    return arrays["failure"][:, 0] < 0 if "failure" in arrays else np.ones(len(arrays["draw"]), dtype=bool)
+
+
+def chosen(arrays: dict, flights: np.ndarray) -> dict:
+    """The arrays (n, ...) of some of the flights (n,)."""
+    return {key: value[flights] for key, value in arrays.items()}
 
 
 def evaluate_dispersed(env_id: str, policy, eval_seed: int, n: int, dispersion: float, **env_options):
     """Fly `policy(obs (m, obs), t) -> action (m, 3)` on the first n draws of a seed, in batches of at most `AT_ONCE`.
 
     Returns the `dispersed_...` metrics of eval.json and the arrays `draw` (n, k), `final_y` (n, 7) with the true mass,
-    `final_t` (n,), `final_error` (n, 6). Flights that crash or run dry are counted, and are among the errors.
+    `final_t` (n,), `final_error` (n, 6). Flights that crash or run dry are counted, and are among the errors. With the
+    option `failure` also the array `failure` (n, 3), as in `final_info`; the metrics are then of the healthy flights.
     """
     rocket = env_options.get("rocket") or ROCKETS[env_id].rocket
-    z, parts = draws(rocket, dispersion, eval_seed, n), []
+    z, parts = draws(rocket, dispersion, eval_seed, n, env_options.get("failure", 0.0)), []
     for first in range(0, n, AT_ONCE):
         parts.append(fly_dispersed(env_id, policy, z[first : first + AT_ONCE], dispersion, **env_options))
     flights = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
-    metrics = {"dispersion": float(dispersion), "dispersed_starts": n} | dispersed_metrics(flights, rocket)
-    return metrics, {"draw": z} | {key: flights[key] for key in ("final_y", "final_t", "final_error")}
+    names = ("final_y", "final_t", "final_error", "failure")
+    arrays = {"draw": z} | {key: flights[key] for key in names if key in flights}
+    if not dispersion:  # healthy flights are then all alike
+        return {}, arrays
+    flights = chosen(flights, healthy(arrays))
+    metrics = {"dispersion": float(dispersion), "dispersed_starts": len(flights["error"])}
+    return metrics | (dispersed_metrics(flights, rocket) if len(flights["error"]) else {}), arrays
 
 
 def fly_dispersed(env_id: str, policy, z: np.ndarray, dispersion: float, **env_options) -> dict:
@@ -155,6 +177,28 @@ def dispersed_metrics(flights: dict, rocket: Rocket) -> dict:
     metrics |= {"dispersed_mass_mean_kg": mass.mean(), "dispersed_mass_p01_kg": np.percentile(mass, 1)}
     counts = {"dispersed_dry": int(flights["dry"].sum()), "dispersed_crashed": int(flights["crashed"].sum())}
     return {key: float(value) for key, value in metrics.items() if np.isfinite(value)} | counts
+
+
+def failure_metrics(arrays: dict, known_mass: np.ndarray, dry_mass: np.ndarray) -> dict:
+    """The statistics of the flights with a failure, of n flights as `evaluate_dispersed` returns their arrays.
+
+    known_mass (n,) kg: what the optimum has left that knows of the failure from its strike on, its dry mass relaxed
+    (`rescue.py`; NaN where none was found); dry_mass (n,) kg. A flight is savable where the first is above the second.
+    Errors and the rate are of the savable flights, the mass that is short of the optimum's of those that were saved.
+    """
+    has_failed = ~healthy(arrays)
+    savable = has_failed & (known_mass > dry_mass)
+    errors = np.linalg.norm(arrays["final_error"], axis=1)
+    saved = savable & (errors < SUCCESS)
+    counts = {"failure_starts": int(has_failed.sum()), "failure_savable": int(savable.sum())}
+    metrics = {}
+    if savable.any():
+        metrics["failure_saved_rate"] = saved.sum() / savable.sum()
+        metrics["failure_error_median"] = np.median(errors[savable])
+        metrics["failure_error_p95"] = np.percentile(errors[savable], 95)
+    if saved.any():
+        metrics["failure_mass_short_mean_kg"] = (known_mass - arrays["final_y"][:, 6])[saved].mean()
+    return counts | {key: float(value) for key, value in metrics.items()}
 
 
 def element_misses(flights: dict, rocket: Rocket) -> dict:

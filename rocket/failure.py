@@ -1,0 +1,122 @@
+"""A hidden loss of thrust: in half of the flights one engine type gives less from a moment of its burn on.
+
+Thrust and propellant flow fall together, so that the engines burn for longer; what is known of a loss is how the flight
+goes. The engines that may fail are the groups of `engine_groups`, types that are dropped together: of the paper's
+rocket the six boosters, the three, stage 1 and stage 2. Each burns once, from its ignition until its propellant is
+spent, and all are equally likely to fail.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from common.errors import is_finite, refuse_unless
+from rocket.vehicle import Rocket, engine_groups
+
+FAILURE_TIMES = ("random", "ignition")
+LARGEST_FAILURE = 0.3  # share of thrust
+FAILURE_PROBABILITY = 0.5
+# numbers from 0 to 1, all alike likely; a flight fails where the first is below `FAILURE_PROBABILITY`
+FAILURE_DRAW = ("failure", "failed_burn", "moment", "share")
+HEALTHY_DRAW = (1.0, 0.0, 0.0, 0.0)
+
+
+def check_failure(failure: float, failure_time: str, cutoff: bool):
+    """BadInput for failures that cannot be drawn, or of a mission whose flights all end at one time."""
+    possible = is_finite(failure) and 0 <= failure <= LARGEST_FAILURE
+    refuse_unless(possible, "failure", repr(failure), f"must be a number from 0 to {LARGEST_FAILURE}")
+    allowed = f"must be one of {', '.join(FAILURE_TIMES)}"
+    refuse_unless(failure_time in FAILURE_TIMES, "failure_time", repr(failure_time), allowed)
+    refuse_unless(cutoff or not failure, "failure", failure, NEEDS_CUTOFF)
+
+
+NEEDS_CUTOFF = "must be 0 where flights end at a fixed time: engines that burn for longer need an id with cut-off"
+
+
+class Losses(NamedTuple):
+    """What N flights lose: of each group of engines (G of them) a share of thrust and flow, from a moment on.
+
+    Seconds are counted while the group burns.
+    """
+
+    after: np.ndarray  # (G, N) s that the group has burnt when the failure strikes; infinite where it stays healthy
+    share: np.ndarray  # (G, N) lost from then on
+
+    def lasts(self, g: int, seconds):
+        """For how long (N,) s group g burns what it would burn in `seconds` (N,) if it stayed healthy."""
+        after = self.after[g]
+        return np.minimum(seconds, after) + np.maximum(seconds - after, 0.0) / (1 - self.share[g])
+
+    def spent(self, g: int, seconds):
+        """In how long (N,) s group g would burn what it burns in `seconds` (N,) if it stayed healthy."""
+        after = self.after[g]
+        return np.minimum(seconds, after) + np.maximum(seconds - after, 0.0) * (1 - self.share[g])
+
+    def strike(self, groups, end: np.ndarray, seconds_lit: np.ndarray) -> np.ndarray:
+        """When the failures strike, (N,) s after lift-off, infinite where none does.
+
+        end (B, N) s: the burns' ends; seconds_lit (G, N): what `burn_ends` returns beside them.
+        """
+        begin = np.vstack([np.zeros_like(end[:1]), end[:-1]])
+        strike = np.full(end.shape[1], np.inf)
+        for g, group in enumerate(groups):
+            lit = np.zeros_like(strike)  # s until the burn begins
+            for k in sorted(group.burns):
+                until_strike = self.after[g] - lit
+                is_here = (until_strike >= 0) & (until_strike < end[k] - begin[k])
+                strike = np.where(is_here, begin[k] + until_strike, strike)
+                lit = lit + (end[k] - begin[k])
+        return strike
+
+
+def no_losses(groups, n: int) -> Losses:
+    """Those of n healthy flights."""
+    return Losses(np.full((len(groups), n), np.inf), np.zeros((len(groups), n)))
+
+
+def failing_groups(rocket: Rocket, failure_time: str = "random") -> list[int]:
+    """The groups of engines that may fail, as indices of `engine_groups`: those with thrust; "ignition": the last."""
+    with_thrust = [g for g, group in enumerate(engine_groups(rocket)) if group.burns and group.engine.thrust]
+    return with_thrust if failure_time == "random" else with_thrust[-1:]
+
+
+def group_names(rocket: Rocket) -> list[str]:
+    """The groups of engines in words: how many leave and when, "6 until 75.2 s"."""
+    groups = engine_groups(rocket)
+    return [f"{group.number} until {rocket.burns[group.dropped_after].end:g} s" for group in groups]
+
+
+def drawn_losses(
+    rocket: Rocket, draw: np.ndarray, failure: float, failure_time: str, seconds_lit: np.ndarray
+) -> Losses:
+    """The losses of draws (N, 4), numbers as in `FAILURE_DRAW`, at most the share `failure`.
+
+    seconds_lit (G, N): how long the groups burn in these flights if they stay healthy.
+    """
+    has_failed, which, moment, share = draw.T
+    groups = failing_groups(rocket, failure_time)
+    group = np.array(groups)[np.minimum((which * len(groups)).astype(int), len(groups) - 1)]
+    losses = no_losses(seconds_lit, len(draw))
+    flights = np.flatnonzero(has_failed < FAILURE_PROBABILITY)
+    failed = group[flights], flights
+    losses.after[failed] = (moment * (failure_time == "random"))[flights] * seconds_lit[failed]
+    losses.share[failed] = failure * share[flights]
+    return losses
+
+
+def failure_scores(rng: np.random.Generator, n: int, in_pairs: bool = False) -> np.ndarray:
+    """The failures of n draws (n, 4). In pairs, x and 1 - x: then one flight of each pair fails."""
+    if not in_pairs:
+        return rng.random((n, len(FAILURE_DRAW)))
+    half = rng.random((-(-n // 2), len(FAILURE_DRAW)))
+    return np.stack([half, 1 - half], axis=1).reshape(-1, len(FAILURE_DRAW))[:n]
+
+
+def largest_failures(rocket: Rocket, failure_time: str) -> np.ndarray:
+    """(F, 4): draws of the longest burns: each group that may fail loses all that it may, from its ignition on."""
+    count = len(failing_groups(rocket, failure_time))
+    which = (np.arange(count) + 0.5) / count
+    zeros = np.zeros(count)
+    return np.column_stack([zeros, which, zeros, zeros + 1])
