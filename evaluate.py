@@ -23,7 +23,7 @@ import numpy as np
 
 import baselines  # noqa: F401 - makes every id known to `task_of`
 from common.checkpoints import read_checkpoint, write_bfloat16
-from common.command_line import OneLineParser, integer, longitude, named_path, output_file, positive, utc
+from common.command_line import OneLineParser, integer, longitude, named_path, number, output_file, positive, utc
 from common.curves import evaluated, read_csv, read_curve, write_csv
 from common.errors import BadInput
 from common.evaluations import read_evaluation, read_json, read_metrics, sha256_of
@@ -109,8 +109,7 @@ def shorten(run_dir) -> Path:
         policy = staged / "agent.safetensors"
         write_bfloat16(run_dir / "agent.safetensors", policy)
         flags = {"checkpoint": policy, "eval-npz": staged / "eval.npz", "eval-json": staged / "eval.json"}
-        if "dispersion" in args:
-            flags["dispersion"] = args["dispersion"]
+        flags |= {name: args[name] for name in ("dispersion", "failure") if name in args}
         command = [sys.executable, script, "--eval-only", "--no-cuda", *(f"--{name}={flags[name]}" for name in flags)]
         flown = subprocess.run(command, stderr=subprocess.PIPE, text=True)
         if flown.returncode:
@@ -130,7 +129,7 @@ def keep_excerpt(path, task):
 def of_another_policy(folder) -> list[str]:
     """What a folder holds of the policy that it ships, beside the three files: it would look current."""
     figures = [path for path in (folder / "figures").glob("*") if path.is_file()]
-    return ["opponents.json", *(f"figures/{path.name}" for path in figures)]
+    return ["opponents.json", "opponents.npz", *(f"figures/{path.name}" for path in figures)]
 
 
 def move(staged, folder, last, replaced):
@@ -259,6 +258,8 @@ def opponents_command(args):
     task.fly_opponents(
         args.folder,
         dispersion=args.dispersion,
+        failure=args.failure,
+        failure_time=args.failure_time,
         n=args.starts or task.default_flights(is_brief=False, dispersion=args.dispersion),
         solved=args.solved,
         eval_seed=args.eval_seed,
@@ -318,7 +319,11 @@ def parse_args(argv=None):
         "opponents", help="classical guidance and other policies on the same dispersed flights"
     )
     command.add_argument("folder", type=Path, help="results/<name> of a rocket with cut-off")
-    command.add_argument("--dispersion", type=positive, default=1.0, metavar="K", help="default 1: envs.Dispersion")
+    command.add_argument("--dispersion", type=positive, default=1.0, metavar="D", help="default 1: envs.Dispersion")
+    lost = "and failures that lose up to this share of thrust, from 0 to 0.3: default 0, none"
+    command.add_argument("--failure", type=number(0, 0.3), default=0.0, metavar="K", help=lost)
+    strikes = "when these strike: random (default) or ignition"
+    command.add_argument("--failure-time", default="random", metavar="WHEN", help=strikes)
     size = integer(10, 100_000)
     command.add_argument("--starts", type=size, metavar="N", help="flights (default: as many as an evaluation has)")
     command.add_argument(

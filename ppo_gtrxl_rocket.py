@@ -3,6 +3,7 @@
     python ppo_gtrxl_rocket.py --seed 1                                 # the paper's 961 s, as results/rocket_fixed
     python ppo_gtrxl_rocket.py --seed 1 --env-id RocketAscentCutoff-v0  # free final time
     python ppo_gtrxl_rocket.py --seed 1 --env-id RocketAscentCutoff-v0 --dispersion 1    # every flight another vehicle
+    python ppo_gtrxl_rocket.py --seed 1 --env-id RocketAscentCutoff-v0 --dispersion 1 --failure 0.3  # half lose thrust
     python ppo_gtrxl_rocket.py --seed 1 --recipe paper                  # plain PPO with Table 1
     python ppo_gtrxl_rocket.py --eval-only --checkpoint results/rocket_fixed/agent.safetensors
 
@@ -62,18 +63,20 @@ class Args:
     checkpoint: str | None = None  # start from these weights (.safetensors)
     resume: str | None = None  # run folder of an interrupted run to go on with, bit for bit
     eval_only: bool = False  # fly the mean action of --checkpoint, train nothing, write only --eval-json and --eval-npz
-    eval_starts: int | None = None  # with --dispersion: drawn flights (default 1705; 100 in a training cut short)
+    eval_starts: int | None = None  # with --dispersion or --failure: drawn flights (default 1705; 100 if cut short)
     eval_seed: int = 0  # seed of the evaluation starts
     eval_json: str | None = None  # where --eval-only writes the metrics
     eval_npz: str | None = None  # where --eval-only writes the trajectories
-    eval_every: int = 5  # evaluate every so many updates, with --dispersion on its own draws (0: only at the end)
+    eval_every: int = 5  # evaluate every so many updates, drawn flights on their own draws (0: only at the end)
 
     # environment
     env_id: str = "RocketAscent-v0"  # the id of the environment, one of ENV_IDS
     observe_phase: bool = True  # show time and phase to the policy
     dispersion: float = 0.0  # spread of the vehicles: 0 all are nominal; 1 each flight draws one by `envs.Dispersion`
     observe_draw: bool = False  # show the drawn vehicle to the policy, which no real flight could know
-    observe_mass: bool = False  # show the true mass of a dispersed rocket, not the flight computer's
+    observe_mass: bool = False  # show the true mass of a drawn rocket, not the flight computer's
+    failure: float = 0.0  # half of the flights lose thrust, by up to this share, in one of their burns (with cut-off)
+    failure_time: str = "random"  # when: "random", or "ignition", the last stage's
 
     # Table 1
     num_blocks: int = 6  # number of GTrXL blocks (0: a plain MLP, without memory)
@@ -161,23 +164,31 @@ FIRST_POLICY = {  # the policy with which a dispersed training begins, by enviro
 }
 
 
+def has_draws(args):
+    """Whether every flight draws its own vehicle or failure."""
+    return bool(args.dispersion or args.failure)
+
+
 def recipe(args):
     """What our recipe changes for the environments of `args`; an id without a recipe takes its family's."""
     family = CUTOFF if ROCKETS[args.env_id].cutoff else FIXED
     changes = RECIPES.get(args.env_id, family)
-    if not args.dispersion:
+    if not has_draws(args):
         return changes
     first_policy = args.checkpoint or FIRST_POLICY.get(args.env_id)
     if first_policy is None:
-        todo = "train without --dispersion first, and name that policy by --checkpoint"
-        print(f"--dispersion: no policy of {args.env_id} to begin with, so this training begins anew; better {todo}")
+        flag = "--dispersion" if args.dispersion else "--failure"
+        todo = f"train without {flag} first, and name that policy by --checkpoint"
+        print(f"{flag}: no policy of {args.env_id} to begin with, so this training begins anew; better {todo}")
         return {**changes, "num_envs": DISPERSED["num_envs"], "flights_per_start": DISPERSED["flights_per_start"]}
     return {**changes, **DISPERSED, "checkpoint": first_policy}
 
 
 # Problem: input and action (features, frame and first action are ours) ------------------------------------------------
 ENV_IDS = tuple(ROCKETS)
-ENV_OPTIONS = ("observe_phase", "dispersion", "observe_draw", "observe_mass")  # arguments of the environments
+ENV_OPTIONS = (  # arguments of the environments
+    "observe_phase", "dispersion", "observe_draw", "observe_mass", "failure", "failure_time",
+)  # fmt: skip
 FIXED_OPTIONS = {"action_frame": "local"}  # those that no flag sets: up, along-track, cross-track
 BUFFERS = {env_id: policy_constants(mission.rocket) for env_id, mission in ROCKETS.items()}  # read as agent.<name>
 INITIAL_ACTION = [1.0, 0.0, 0.0]  # straight up (local frame): a randomly steered rocket never leaves the ground
@@ -275,12 +286,12 @@ def set_curriculum(envs, args, progress):
 
     R_terminal = -2 ln(1 + error / scale): below the scale all errors earn almost the same. Noise scatters the errors of
     the flights by about std / 10. So the scale falls with the noise, as std / 8, if --log-std is a schedule. It is at
-    most TERMINAL_SCALE, and at least 0.001 with --dispersion (less was no better).
+    most TERMINAL_SCALE, and at least 0.001 where flights differ (less was no better).
     """
     envs.terminal_scale = TERMINAL_SCALE
     if isinstance(args.log_std, str):
         std = math.exp(value_at(args.log_std, progress))
-        smallest = 0.001 if args.dispersion else 0.0
+        smallest = 0.001 if has_draws(args) else 0.0
         envs.terminal_scale = min(TERMINAL_SCALE, max(std / 8, smallest))
     envs.guidance = args.guidance
     group = round(value_at(args.flights_per_start, progress))
@@ -294,7 +305,7 @@ def add_rewards(envs, args, progress, batch, episodes):
     if not envs.cutoff or weight == 0:
         return
     all_flights = len(episodes["error"])  # of all processes
-    group = envs.flights_per_start if args.dispersion else all_flights  # without dispersion all have the same start
+    group = envs.flights_per_start if has_draws(args) else all_flights  # without draws all have the same start
     paid = weight * mass_rewards(episodes, envs.rocket, envs.terminal_scale, group)
     paid = runs.local_shard(paid, envs.num_envs)  # the part of this process's flights
     last_step = batch.alive.sum(0).long() - 1  # (N,)
@@ -341,10 +352,10 @@ def before_training(agent, args, env_options):
     The draw and the differences are new inputs to that policy. Their weights are set to 0, so at first it flies as
     before.
     """
-    begins = args.dispersion and args.checkpoint is not None and args.resume is None and not args.eval_only
+    begins = has_draws(args) and args.checkpoint is not None and args.resume is None and not args.eval_only
     if not begins or agent.nominal_flight.any():  # a policy of a dispersed training has its nominal flight already
         return
-    envs = gym.make_vec(args.env_id, num_envs=1, **{**env_options, "dispersion": 0.0})
+    envs = gym.make_vec(args.env_id, num_envs=1, **{**env_options, "dispersion": 0.0, "failure": 0.0})
     fly_nominal(agent, agent.make_policy(envs.episode_steps), envs)
     draw = envs.single_observation_space.shape[0] - OBSERVED
     agent.encoder[0].weight[:, -(draw + len(DIFFERENCES)) :] = 0.0

@@ -39,7 +39,6 @@ from common.curves import read_curve
 from common.errors import BadInput, NoOptimum
 from common.evaluations import write_evaluation
 from common.tasks import Task, task_of
-from landing.lander import FAILURE_TIMES
 
 gc.freeze()  # what was imported is never garbage; looking through it took a fifth of the time of --help
 
@@ -81,10 +80,11 @@ RANGES = {  # lowest and highest value of every numeric flag; NaN and infinity a
     **{"failure_probability": (0.0, 1.0), "decision_s": (0.2, 10.0), "longest_flight": (1.0, 1000.0)},
     **dict.fromkeys(["failure_size", "training_failure_size"], (1.0, 100.0)),
     **{"thrust_share": (0.2, 1.0), "action_hold": (1.0, 500.0)},
+    "failure": (0.0, 0.3),
 }
-CHOICES = {"recipe": ("ours", "paper"), "failure_time": FAILURE_TIMES}
+RECIPE_WORDS = ("ours", "paper")
 NETWORK = ("num_blocks", "embed_dim", "num_heads", "memory_length", "mlp_dim", "hidden_dim")
-NOT_OF_A_CHECKPOINT = {"dispersion"}  # options of the environment that are chosen anew for every run and evaluation
+NOT_OF_A_CHECKPOINT = {"dispersion", "failure"}  # options of the environment: chosen anew for each run and evaluation
 MAY_DIFFER_FROM_A_CHECKPOINT = {"failure_probability", "failure_size", "failure_time"}  # else they are the file's
 MAY_CHANGE_ON_RESUME = {"resume", "cuda", "num_threads"}
 
@@ -152,7 +152,7 @@ def parse_args(kind, recipe, argv, env_options, buffers):
     task = task_of(args.env_id)
     if unfit := task.refusal(not args.eval_only, **options_of(args, env_options)):
         name, why = unfit
-        refuse(name, "", why)
+        refuse(name, getattr(args, name, ""), why)
     check_share(args, typed)
     if args.eval_only and saved and saved["progress"]["seed"] == args.eval_seed:
         if remark := task.remark_on_seed(args.eval_seed):
@@ -241,10 +241,9 @@ def take_checkpoint_args(args, kind, typed, env_options, buffers):
 
 def check_values(args, env_ids):
     """Refuse a number out of its range, and a word that is not among those of its flag."""
-    for name, choices in {"env_id": env_ids, **CHOICES}.items():
-        value = getattr(args, name, choices[0])
-        if value not in choices:
-            refuse(name, value, f"must be one of {', '.join(choices)}")
+    check_word(args, "env_id", env_ids)
+    for name, words in {"recipe": RECIPE_WORDS, **task_of(args.env_id).choices()}.items():
+        check_word(args, name, words)
     kinds = get_type_hints(type(args), include_extras=True)
     for name, value in vars(args).items():
         if name not in RANGES or value is None:
@@ -255,6 +254,13 @@ def check_values(args, env_ids):
             refuse(name, value, f"must be between {low} and {high}")
     if not all(number.is_integer() for number in schedule_values("flights_per_start", args.flights_per_start)):
         refuse("flights_per_start", args.flights_per_start, "must be whole numbers")
+
+
+def check_word(args, name, words):
+    """Refuse a flag that is none of the words that it may be; a script need not have it."""
+    value = getattr(args, name, words[0])
+    if value not in words:
+        refuse(name, value, f"must be one of {', '.join(words)}")
 
 
 def check(args, env_ids):

@@ -29,6 +29,21 @@ def integer(low: int, high: int) -> Callable:
     return parse
 
 
+def number(low: float, high: float) -> Callable:
+    """Argument type: a number from `low` to `high`."""
+
+    def parse(text):
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not low <= value <= high:
+            raise argparse.ArgumentTypeError(f"{text!r} must be a number from {low} to {high}")
+        return value
+
+    return parse
+
+
 def positive(text: str) -> float:
     """Argument type: a dispersion that disperses."""
     try:

@@ -78,6 +78,10 @@ class Task(Protocol):
         """What to print where the evaluation's seed is that of the training."""
         ...
 
+    def choices(self) -> dict[str, tuple[str, ...]]:
+        """The words that flags of this task may take: name -> words."""
+        ...
+
     def refusal(self, trains: bool, **env_options) -> tuple[str, str] | None:
         """A flag (`no_observe_phase`) that does not fit these options, and why; None where all fit."""
         ...
@@ -166,6 +170,9 @@ class SampledTask:
 
     def interim_flights(self, n: int, **env_options) -> int:
         return n
+
+    def choices(self) -> dict[str, tuple[str, ...]]:
+        return {}
 
     def remark_on_seed(self, eval_seed: int) -> str | None:
         return f"--eval-seed {eval_seed} is the training's --seed: it may have flown these starts"

@@ -179,12 +179,24 @@ def cell(row: dict, heading: str, keys: tuple, digits: str, width: int) -> str:
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def compare(env_id: str, folder: Path, dispersion: float, n: int, solved: int, eval_seed: int, also=()):
+def compare(
+    env_id: str,
+    folder: Path,
+    dispersion: float,
+    n: int,
+    solved: int,
+    eval_seed: int,
+    also=(),
+    failure: float = 0.0,
+    failure_time: str = "random",
+):
     """Compare a results folder's policy, and those of `also` (name, path), with all laws; print, write opponents.json.
 
-    All meet the failures of the folder's eval.json. `dispersion` is a rocket's.
+    All meet the failures of the folder's eval.json. `dispersion`, `failure` and `failure_time` are a rocket's.
     """
-    refuse_unless(dispersion == 1.0, "--dispersion", dispersion, f"is no flag of {env_id}; leave it out")
+    given = {"dispersion": (dispersion, 1.0), "failure": (failure, 0.0), "failure-time": (failure_time, "random")}
+    for name, (value, default) in given.items():
+        refuse_unless(value == default, f"--{name}", value, f"is no flag of {env_id}; leave it out")
     refuse_unless(solved <= n, "--solved", solved, f"must be at most --starts, {n}")
     refuse_unless(os.access(folder, os.W_OK), "the folder", folder, "must be writable")
     checkpoints = {"policy": folder / "agent.safetensors"}
@@ -195,11 +207,11 @@ def compare(env_id: str, folder: Path, dispersion: float, n: int, solved: int, e
         other = read_checkpoint(path, {}, flag="")["args"]["env_id"]
         refuse_unless(other == env_id, f"the env_id of {path}", other, f"must be {env_id}, as that of {folder}")
     metrics = json.loads((folder / "eval.json").read_text())
-    failure = {name: metrics[name] for name in FAILURE}
-    rows = {name: fly_checkpoint(path, failure, eval_seed, n) for name, path in checkpoints.items()}
-    rows |= fly_laws(env_id, failure, eval_seed, n, solved)
+    failures = {name: metrics[name] for name in FAILURE}
+    rows = {name: fly_checkpoint(path, failures, eval_seed, n) for name, path in checkpoints.items()}
+    rows |= fly_laws(env_id, failures, eval_seed, n, solved)
     published = {name: dict(zip(PUBLISHED_KEYS, values)) for name, values in PUBLISHED.items()}
-    report = {"env_id": env_id, "eval_seed": eval_seed, "solved": solved} | failure
+    report = {"env_id": env_id, "eval_seed": eval_seed, "solved": solved} | failures
     report |= {"laws": rows, "published_law": published_rows(env_id, eval_seed, n), "published": published}
     write_json(folder / "opponents.json", report)
     print(table(report))

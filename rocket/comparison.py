@@ -19,20 +19,25 @@ import numpy as np
 
 from common.checkpoints import read_checkpoint
 from common.errors import refuse_unless
-from common.files import write_json
+from common.files import write_json, write_npz
 from common.policies import evaluate_by_script
 from rocket import guidance
 from rocket.dispersion import draw_vehicles
+from rocket.failure import check_failure
 from rocket.metrics import (
     AT_ONCE,
     SUCCESS,
+    chosen,
     decision_us,
     dispersed_metrics,
     draws,
     evaluate_dispersed,
+    failure_metrics,
     final_elements,
+    healthy,
 )
 from rocket.missions import ROCKETS
+from rocket.rescue import Failing, Known, directions_at, failing_optima, known_optima
 from rocket.vehicle import Rocket
 
 POLICY_SCRIPT = Path(__file__).parents[1] / "ppo_gtrxl_rocket.py"
@@ -61,7 +66,7 @@ def knowledge(args: dict) -> str:
     return knows + (", the draw itself" if args.get("observe_draw") else "")
 
 
-def fly_checkpoint(path, dispersion: float, eval_seed: int, n: int):
+def fly_checkpoint(path, dispersion: float, eval_seed: int, n: int, **failures):
     """A policy on the first n draws of a seed: the arrays of `evaluate_dispersed`, `knows` and `decision_us`.
 
     BadInput with the script's own line where it refuses.
@@ -70,11 +75,13 @@ def fly_checkpoint(path, dispersion: float, eval_seed: int, n: int):
     with tempfile.TemporaryDirectory() as folder:
         files = [Path(folder) / name for name in ("eval.json", "eval.npz")]
         flags = {"dispersion": dispersion, "eval-starts": n, "eval-seed": eval_seed}
+        flags |= {name.replace("_", "-"): value for name, value in failures.items()}
         flags |= {"eval-json": files[0], "eval-npz": files[1], "num-threads": 1}
         evaluate_by_script(POLICY_SCRIPT, path, flags)
         decision_us = json.loads(files[0].read_text())["decision_us"]
         with np.load(files[1]) as file:
-            arrays = {key: file[key] for key in ("draw", "final_y", "final_t", "final_error")}
+            names = ("draw", "final_y", "final_t", "final_error", "failure")
+            arrays = {key: file[key] for key in names if key in file}
     return arrays, {"knows": knowledge(args), "decision_us": decision_us}
 
 
@@ -86,18 +93,21 @@ def fly_checkpoint(path, dispersion: float, eval_seed: int, n: int):
 class Comparison:
     """Policies and opponents on the first `n` draws of a seed; what solves for each flight on the first `solved`.
 
-    `arrays`: by name, those of `evaluate_dispersed`; `about`: by name, `knows` and `decision_us`.
+    `arrays`: by name, those of `evaluate_dispersed`; `about`: by name, `knows` and `decision_us`. `failures` are the
+    options `failure` and `failure_time` of the environment, or none: then what is said of a competitor is of its
+    healthy flights, but for `failure_metrics`.
     """
 
-    def __init__(self, env_id: str, dispersion: float, eval_seed: int, n: int, solved: int):
+    def __init__(self, env_id: str, dispersion: float, eval_seed: int, n: int, solved: int, **failures):
         self.env_id, self.rocket, self.dispersion = env_id, ROCKETS[env_id].rocket, dispersion
         self.eval_seed, self.n, self.solved = eval_seed, n, solved
+        self.failures, self.failing = failures, Failing(dispersion, **failures)
         self.arrays, self.about, self.optima = {}, {}, []
 
     def fly_policies(self, checkpoints: dict):
         """Fly the policies of these files, name -> agent.safetensors; ValueError where one flew other draws."""
-        z = draws(self.rocket, self.dispersion, self.eval_seed, self.n)
-        fly = lambda path: fly_checkpoint(path, self.dispersion, self.eval_seed, self.n)  # noqa: E731
+        z = self.draws(self.n)
+        fly = lambda path: fly_checkpoint(path, self.dispersion, self.eval_seed, self.n, **self.failures)  # noqa: E731
         with ThreadPoolExecutor(PROCESSES) as pool:  # each thread waits for a process
             for name, flown in zip(checkpoints, pool.map(fly, checkpoints.values())):
                 if not np.array_equal(flown[0]["draw"], z):
@@ -114,12 +124,21 @@ class Comparison:
         drawn = guidance.drawn_exhaust(self.rocket, self.dispersion, z)
         for name, exhaust in zip(REPLANS, (None, guidance.nominal_exhaust(self.rocket), drawn)):
             self.replan(name, exhaust)
-        self.optima = self.solve()
-        self.fly("optimum", guidance.fly_optima(env_id, self.optima), self.solved)
+        if self.failures:
+            self.optima = failing_optima(env_id, ROCKETS[env_id], self.failing, self.draws(self.solved), PROCESSES)
+        else:
+            self.optima = self.solve()
+        self.fly("optimum", guidance.fly_optima(env_id, self.optima, directions_at), self.solved)
+
+    def draws(self, n: int) -> np.ndarray:
+        """The first n draws of the seed."""
+        return draws(self.rocket, self.dispersion, self.eval_seed, n, self.failing.failure)
 
     def fly(self, name: str, opponent, n: int):
         """Fly an opponent on the first n draws; what solves tells the time of its decisions itself."""
-        _, self.arrays[name] = evaluate_dispersed(self.env_id, opponent, self.eval_seed, n, self.dispersion)
+        _, self.arrays[name] = evaluate_dispersed(
+            self.env_id, opponent, self.eval_seed, n, self.dispersion, **self.failures
+        )
         self.about[name] = {"knows": KNOWLEDGE[name]}
         if name not in (*REPLANS, "optimum"):
             self.about[name]["decision_us"] = decision_us(self.env_id, opponent)
@@ -136,19 +155,54 @@ class Comparison:
         """The optima that know the draws of the first flights, to the target or to the orbits of `reached`.
 
         `reached`: states (n, 7), competitor by competitor; solved in one go, since processes take seconds to start.
+        Of flights with a failure none is solved: None.
         """
-        z = draws(self.rocket, self.dispersion, self.eval_seed, self.solved)
+        z = self.draws(self.solved)
         if reached is not None:
             z = np.tile(z, (len(reached) // len(z), 1))
-        return guidance.drawn_optima(self.env_id, self.dispersion, z, reached, PROCESSES)
+        flights = np.flatnonzero(self.vehicles(z).failure[0] < 0)
+        of_reached = None if reached is None else reached[flights]
+        optima: list = [None] * len(z)
+        found = guidance.drawn_optima(self.env_id, self.dispersion, z[flights], of_reached, PROCESSES)
+        for k, optimum in zip(flights, found):
+            optima[k] = optimum
+        return optima
+
+    def vehicles(self, z: np.ndarray):
+        """The vehicles of draws z (n, k)."""
+        return draw_vehicles(self.rocket, self.dispersion, z, self.failing.failure, self.failing.failure_time)
 
     def metrics(self, name: str, n: int) -> dict:
-        """The `dispersed_...` metrics of a competitor's first n flights, or of all where it flew fewer."""
-        flights = recorded_flights(
-            {key: value[:n] for key, value in self.arrays[name].items()}, self.rocket, self.dispersion
-        )
+        """The metrics of a competitor's first n flights, or of all where it flew fewer."""
+        arrays = {key: value[:n] for key, value in self.arrays[name].items()}
+        flights = recorded_flights(chosen(arrays, healthy(arrays)), self.rocket, self.dispersion)
         starts = len(flights["error_norm"])
-        return {"dispersed_starts": starts} | dispersed_metrics(flights, self.rocket)
+        metrics = {"dispersed_starts": starts} | dispersed_metrics(flights, self.rocket)
+        if self.failures:
+            known = self.known().first(len(arrays["draw"]))
+            reached = known.mass_at(arrays["final_error"], self.rocket)
+            metrics |= failure_metrics(arrays, known.mass, reached, self.vehicles(arrays["draw"]).dry_mass)
+        return metrics
+
+    def known(self) -> Known:
+        """What the optima leave that know of a failure from its strike on."""
+        return known_optima(self.env_id, ROCKETS[self.env_id], self.failing, self.eval_seed, self.n)
+
+    def flights_by_loss(self) -> dict:
+        """The arrays of opponents.npz: each flight's failure, what could be saved of it, and how each competitor ended.
+
+        `failure` (n, 3), `best_mass_kg` (n,), what the optimum leaves that knows of it, and `dry_mass_kg` (n,); of each
+        competitor's flights, the first ones, `<name>_error_norm`, `<name>_final_mass_kg` and `<name>_mass_reached_kg`,
+        what the same optimum leaves in the orbit reached.
+        """
+        vehicles, known = self.vehicles(self.draws(self.n)), self.known()
+        arrays = {"failure": vehicles.failure.T, "best_mass_kg": known.mass, "dry_mass_kg": vehicles.dry_mass}
+        for name, ends in self.arrays.items():
+            error = ends["final_error"]
+            arrays[f"{name}_error_norm"] = np.linalg.norm(error, axis=1)
+            arrays[f"{name}_final_mass_kg"] = ends["final_y"][:, 6]
+            arrays[f"{name}_mass_reached_kg"] = known.first(len(error)).mass_at(error, self.rocket)
+        return {name: values.astype(np.float32) for name, values in arrays.items()}
 
     def shares(self, name: str, reached: list) -> dict:
         """A competitor's mass over that of the optimum that knows the draw: to the target, and to the orbit `reached`.
@@ -156,7 +210,7 @@ class Comparison:
         Of those of the first flights that are successes and whose optimum was found.
         """
         ends, shares = {key: value[: self.solved] for key, value in self.arrays[name].items()}, {}
-        success = np.linalg.norm(ends["final_error"], axis=1) < SUCCESS
+        success = (np.linalg.norm(ends["final_error"], axis=1) < SUCCESS) & healthy(ends)
         for key, optima in (("target", self.optima), ("reached", reached)):
             mass = np.array([optimum["final_mass"] if optimum else np.nan for optimum in optima])
             share = (ends["final_y"][:, 6] / mass)[success & np.isfinite(mass)]
@@ -167,8 +221,9 @@ class Comparison:
 
     def report(self) -> dict:
         """What opponents.json holds: of each its metrics, those of its first flights (`first`), and `shares`."""
-        report = {"env_id": self.env_id, "dispersion": self.dispersion, "eval_seed": self.eval_seed}
-        masses = [optimum["final_mass"] for optimum in self.optima if optimum]
+        report = {"env_id": self.env_id, "dispersion": self.dispersion, "eval_seed": self.eval_seed} | self.failures
+        is_healthy = self.vehicles(self.draws(self.solved)).failure[0] < 0
+        masses = [optimum["final_mass"] for optimum, counts in zip(self.optima, is_healthy) if optimum and counts]
         report["bound_flights"] = len(masses)
         if masses:
             report["bound_mass_mean_kg"] = float(np.mean(masses))
@@ -204,6 +259,7 @@ def table(report: dict) -> str:
     """opponents.json as a table: a line a competitor, then the first flights of those that flew more."""
     competitors, known = report["laws"], report["bound_flights"]
     fewest = min(entry["dispersed_starts"] for entry in competitors.values())
+    about = " healthy flights of" if "failure" in report else ""
     rows = [("", *COLUMNS)]
     rows += [(name, *cells(entry, entry, known)) for name, entry in competitors.items()]
     for name, entry in competitors.items():
@@ -211,7 +267,7 @@ def table(report: dict) -> str:
             rows.append((f"{name}, the first", *cells(entry, entry["first"], known)))
     width = max(len(row[0]) for row in rows)
     draws = f"the draws of eval seed {report['eval_seed']}, the same for all"
-    lines = [f"{report['env_id']} at dispersion {report['dispersion']:g}, {draws}"]
+    lines = [f"{report['env_id']} at dispersion {report['dispersion']:g},{about} {draws}"]
     for name, *others in rows:
         lines.append(f"  {name:<{width}}" + "".join(f"  {cell:>{w}}" for cell, w in zip(others, WIDTHS)))
     lines.append("  Shares: mean mass over that of the optimum that knows the draw, to the target and to the orbit")
@@ -222,7 +278,31 @@ def table(report: dict) -> str:
     for name in REPLANS:
         solves, failed = (competitors[name][key] for key in ("solves", "solves_failed"))
         lines.append(f"  {name}: {solves} solves, {failed} failed.")
-    return "\n".join(lines)
+    return "\n".join([*lines, *failure_lines(report)])
+
+
+def failure_lines(report: dict) -> list[str]:
+    """The table of the flights with a failure, a line a competitor; none where there are none."""
+    if "failure" not in report:
+        return []
+    when = {"random": "from a random moment of a burn on", "ignition": "from the last stage's ignition on"}
+    lines = [f"Flights with a failure, up to {report['failure']:.0%} of thrust lost {when[report['failure_time']]}"]
+    columns = {
+        "failure_starts": ("flights", "g"),
+        "failure_savable": ("savable", "g"),
+        "failure_saved_rate": ("saved", ".1%"),
+        "failure_error_median": ("||error|| median", ".6f"),
+        "failure_error_p95": ("p95", ".6f"),
+        "failure_mass_short_mean_kg": ("short of the optimum (kg)", ".2f"),
+    }
+    rows = [["", *(head for head, _ in columns.values())]]
+    for name, entry in report["laws"].items():
+        rows.append([name, *(format(entry[key], form) if key in entry else "-" for key, (_, form) in columns.items())])
+    width = max(len(row[0]) for row in rows)
+    for name, *others in rows:
+        cells = (f"  {cell:>{max(len(head), 8)}}" for cell, head in zip(others, rows[0][1:]))
+        lines.append(f"  {name:<{width}}" + "".join(cells))
+    return lines
 
 
 def share(entry: dict, name: str, known: int) -> str:
@@ -279,30 +359,46 @@ def check(env_id: str, folder: Path, n: int, solved: int, checkpoints: dict):
     refuse_unless(os.access(folder, os.W_OK), "the folder", folder, "must be writable")
 
 
-def compare(env_id: str, folder: Path, dispersion: float, n: int, solved: int, eval_seed: int, also=()):
+def compare(
+    env_id: str,
+    folder: Path,
+    dispersion: float,
+    n: int,
+    solved: int,
+    eval_seed: int,
+    also=(),
+    failure: float = 0.0,
+    failure_time: str = "random",
+):
     """Compare a results folder's policy, and those of `also` (name, path), with all opponents; print and write it.
 
-    opponents.json and figures/opponents.png are written when all is flown. OSError or ValueError says what is bad.
+    opponents.json and figures/opponents.png, with failures also opponents.npz (`flights_by_loss`), are written when all
+    is flown. OSError or ValueError says what is bad.
     """
+    check_failure(failure, failure_time, ROCKETS[env_id].cutoff)
     checkpoints = {"policy": folder / "agent.safetensors"}
     for name, path in also:
         is_new = name not in {*checkpoints, *KNOWLEDGE}
         refuse_unless(is_new, "the NAME of --also", name, "must be that of no other row")
         checkpoints[name] = path
     check(env_id, folder, n, solved, checkpoints)
-    comparison = Comparison(env_id, dispersion, eval_seed, n, solved)
+    failures = {"failure": failure, "failure_time": failure_time} if failure else {}
+    comparison = Comparison(env_id, dispersion, eval_seed, n, solved, **failures)
     comparison.fly_policies(checkpoints)
     comparison.fly_opponents()
     report, labelled = comparison.report(), {}
     for name, entry in report["laws"].items():
         label = f"{name}: {entry['dispersed_box_rate']:.1%} of {entry['dispersed_starts']}"
-        labelled[label] = comparison.arrays[name]
+        arrays = comparison.arrays[name]
+        labelled[label] = chosen(arrays, healthy(arrays))
 
     from drawing.style import save_figures
     from rocket.figures import dispersed_figure
 
     title = f"{env_id} at dispersion {dispersion:g}"
     figure = dispersed_figure(comparison.rocket, labelled, title)
+    if failure:
+        write_npz(folder / "opponents.npz", comparison.flights_by_loss())
     write_json(folder / "opponents.json", report)
     print(table(report))
     for path in save_figures(folder / "figures", {"opponents.png": figure}):

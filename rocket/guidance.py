@@ -236,8 +236,9 @@ def remaining_parameters(rocket: Rocket, remaining: RemainingAscent, intervals) 
 def optimise_remaining(rocket: Rocket, remaining: RemainingAscent, guess: dict, intervals: tuple[int, ...]) -> dict:
     """The heaviest end of a remaining ascent, `intervals` of collocation in each of its arcs.
 
-    The guess has t (s), y (r, v), t_u (s), u, as has what is returned, with `final_time` (s) and `final_mass` (kg).
-    Raises NoOptimum where IPOPT finds none.
+    The guess has t (s), y (r, v), t_u (s), u, as has what is returned, with `final_time` (s), `final_mass` (kg) and
+    `orbit_price` (5,), the kg that a unit of each of the numbers of `orbit_defect` saves. Raises NoOptimum where IPOPT
+    finds none.
     """
     n, points, scale = sum(intervals), len(GAUSS_POINTS), state_scale(rocket)
     solve = remaining_solver(rocket, sum(intervals[:-1]), intervals[-1])
@@ -261,7 +262,10 @@ def optimise_remaining(rocket: Rocket, remaining: RemainingAscent, guess: dict, 
     order = np.argsort(times)
     found = {"t": np.append(remaining.begin, times[order]), "y": np.vstack([remaining.state, states[order]])}
     found |= {"t_u": t_u, "u": w[6 * n * (1 + points) : -1].reshape(-1, 3), "status": status}
-    return found | {"final_time": end, "final_mass": remaining.mass[-1] - remaining.flow[-1] * w[-1]}
+    seconds = scale[0] / scale[3]  # the program's unit of time
+    price = remaining.flow[-1] * seconds * solution["lam_g"].full()[len(equal) - 5 : len(equal), 0]
+    found |= {"final_time": end, "orbit_price": price}
+    return found | {"final_mass": remaining.mass[-1] - remaining.flow[-1] * w[-1]}
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -353,7 +357,11 @@ REPLAN_INTERVALS = 8  # of collocation: 12 change the final mass by less than 1e
 
 def optimum_guess(env_id: str) -> dict:
     """The nominal optimum as a guess of `optimise_remaining`."""
-    flight = nominal_optimum(env_id)
+    return guess_of(nominal_optimum(env_id))
+
+
+def guess_of(flight: dict) -> dict:
+    """A flight of `fly_rocket` as a guess of `optimise_remaining`."""
     middle = (flight["t"][:-1] + flight["t"][1:]) / 2
     return {"t": flight["t"], "y": flight["y"][:, :6], "t_u": middle, "u": flight["u"]}
 
@@ -481,12 +489,17 @@ def drawn_ascent(rocket: Rocket, dispersion: float, z, orbit) -> RemainingAscent
     return RemainingAscent(0.0, rocket.x0[:6], end, thrust, flow, mass, h, e, air)
 
 
+def drawn_intervals(rocket: Rocket, end: float) -> tuple[int, ...]:
+    """How many intervals of collocation each burn has in a flight that lasts until about `end` (s)."""
+    ends = np.append([burn.end for burn in rocket.burns[:-1]], end)
+    parts = np.diff(ends, prepend=0.0) / ends[-1]
+    return tuple(max(round(DRAWN_SEGMENTS * part), 1) for part in parts)
+
+
 def solve_drawn(job):
     """The optimum of one flight, None where IPOPT finds none: job is (rocket, dispersion, z, orbit, guess)."""
     rocket, dispersion, z, orbit, guess = job
-    ends = np.append([burn.end for burn in rocket.burns[:-1]], guess["t"][-1])
-    parts = np.diff(ends, prepend=0.0) / ends[-1]
-    intervals = tuple(max(round(DRAWN_SEGMENTS * part), 1) for part in parts)
+    intervals = drawn_intervals(rocket, guess["t"][-1])
     try:
         return optimise_remaining(rocket, drawn_ascent(rocket, dispersion, z, orbit), guess, intervals)
     except NoOptimum:
@@ -508,10 +521,10 @@ def drawn_optima(env_id: str, dispersion: float, z, reached=None, processes: int
         return workers.map(solve_drawn, jobs)
 
 
-def fly_optima(env_id: str, optima: list):
+def fly_optima(env_id: str, optima: list, directions_at=directions_at):
     """The guidance that flies each of the m flights by its own optimum, open loop, by the nominal one where it is None.
 
-    It knows the draw: it is flown to see that the optima's mass can be reached.
+    It knows the draw: it is flown to see that the optima's mass can be reached. `directions_at` is that of the optima.
     """
     nominal, times = open_loop(env_id), middles(ROCKETS[env_id].rocket)
     u = [directions_at(optimum, times) if optimum else None for optimum in optima]

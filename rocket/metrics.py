@@ -179,15 +179,16 @@ def dispersed_metrics(flights: dict, rocket: Rocket) -> dict:
     return {key: float(value) for key, value in metrics.items() if np.isfinite(value)} | counts
 
 
-def failure_metrics(arrays: dict, known_mass: np.ndarray, dry_mass: np.ndarray) -> dict:
+def failure_metrics(arrays: dict, best_mass: np.ndarray, mass_reached: np.ndarray, dry_mass: np.ndarray) -> dict:
     """The statistics of the flights with a failure, of n flights as `evaluate_dispersed` returns their arrays.
 
-    known_mass (n,) kg: what the optimum has left that knows of the failure from its strike on, its dry mass relaxed
-    (`rescue.py`; NaN where none was found); dry_mass (n,) kg. A flight is savable where the first is above the second.
-    Errors and the rate are of the savable flights, the mass that is short of the optimum's of those that were saved.
+    best_mass (n,) kg: what the optimum has left in the target orbit that knows of the failure from its strike on, its
+    dry mass relaxed (`rescue.py`; NaN where none was found). A flight is savable where that is above dry_mass (n,) kg.
+    Errors and the rate are of the savable flights. The mass that is short is that of the saved flights, beside
+    mass_reached (n,) kg, what the same optimum has left in the orbit that the flight reached.
     """
     has_failed = ~healthy(arrays)
-    savable = has_failed & (known_mass > dry_mass)
+    savable = has_failed & (best_mass > dry_mass)
     errors = np.linalg.norm(arrays["final_error"], axis=1)
     saved = savable & (errors < SUCCESS)
     counts = {"failure_starts": int(has_failed.sum()), "failure_savable": int(savable.sum())}
@@ -197,7 +198,7 @@ def failure_metrics(arrays: dict, known_mass: np.ndarray, dry_mass: np.ndarray) 
         metrics["failure_error_median"] = np.median(errors[savable])
         metrics["failure_error_p95"] = np.percentile(errors[savable], 95)
     if saved.any():
-        metrics["failure_mass_short_mean_kg"] = (known_mass - arrays["final_y"][:, 6])[saved].mean()
+        metrics["failure_mass_short_mean_kg"] = (mass_reached - arrays["final_y"][:, 6])[saved].mean()
     return counts | {key: float(value) for key, value in metrics.items()}
 
 

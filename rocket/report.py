@@ -1,9 +1,17 @@
-"""`python baselines.py rocket`, and of one rocket by its id: solve, print rows, checks and the open-loop opponent."""
+"""`python baselines.py rocket`, and of one rocket by its id: solve, print rows, checks and the open-loop opponent.
+
+With --failure: what flights with failures can still reach.
+"""
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 
+from rocket.dispersion import draw_vehicles
+from rocket.failure import group_names
+from rocket.metrics import draws
 from rocket.missions import ROCKETS
 from rocket.optimum import (
     ASCENTS,
@@ -16,6 +24,7 @@ from rocket.optimum import (
     optimise_ascent,
     solve_and_fly,
 )
+from rocket.rescue import Failing, about, solve_known
 
 COLUMNS = ("final_mass_kg", "final_time_s", "error_norm", "replay_error_norm", "max_altitude_km", "solve_seconds")
 
@@ -79,3 +88,38 @@ def open_loop_numbers(flights: dict) -> dict:
             numbers[name] = {part: float(opponent[part]) for part in ("error_norm", "final_mass_kg", "final_time_s")}
             print(f"{name:<40}" + "  ".join(f"{part} {value:.7g}" for part, value in numbers[name].items()))
     return numbers
+
+
+def report_failures(env_id: str, failing: Failing, starts: int, seed: int) -> tuple[dict, dict]:
+    """Solve what the flights with a failure among the draws of a seed can still reach, and print it by their engines.
+
+    The numbers; and the arrays of `Known` and `about`, which evaluations read where the file lies in results/.
+    """
+    mission = ROCKETS[env_id]
+    z = draws(mission.rocket, failing.dispersion, seed, starts, failing.failure)
+    vehicles = draw_vehicles(mission.rocket, failing.dispersion, z, failing.failure, failing.failure_time)
+    group = vehicles.failure[0]
+    began = time.perf_counter()
+    known = solve_known(env_id, mission, failing, z)
+    mass = known.mass
+    seconds = time.perf_counter() - began
+
+    numbers = failing._asdict() | {"starts": starts, "seed": seed, "solve_seconds": seconds}
+    lost = f"up to {failing.failure:.0%} of thrust lost"
+    print(f"{env_id}: {starts} draws of seed {seed}, {lost}, solved in {seconds:.0f} s")
+    heads = ("flights", "solved", "savable", "mass (kg)", "lightest")
+    print(f"  {'':<28}" + "".join(f"{head:>11}" for head in heads))
+    names = group_names(mission.rocket)
+    groups = {"all": group >= 0} | {name: group == g for g, name in enumerate(names)}
+    for name, flights in groups.items():
+        if not flights.any():
+            continue
+        solved = flights & np.isfinite(mass)
+        savable = flights & (mass > vehicles.dry_mass)
+        row = {"flights": int(flights.sum()), "solved": int(solved.sum()), "savable": int(savable.sum())}
+        if solved.any():
+            row |= {"mass_mean_kg": float(mass[solved].mean()), "mass_min_kg": float(mass[solved].min())}
+        numbers[name] = row
+        print(f"  {name:<28}" + "".join(f"{value:>11.6g}" for value in row.values()))
+    words = about(env_id, mission, failing, seed)
+    return numbers, {"about": np.array(words), "mass": mass, "price": known.price.astype(np.float32)}

@@ -29,7 +29,7 @@ def table(metrics: dict, mission: Mission) -> str:
     lines = [f"{metrics['env_id']}: difference from the target, or where there is none from the optimum"]
     for label, *numbers in rows:
         lines.append(f"  {label:<{width}}" + "".join(f" {cell:>11}" for cell in numbers))
-    return "\n".join([*lines, *remarks(metrics, mission), *dispersed_lines(metrics)])
+    return "\n".join([*lines, *remarks(metrics, mission), *dispersed_lines(metrics), *failure_lines(metrics)])
 
 
 def cells(key: str, digits: int, target: float | None, optimum: float | None, ours: float | None) -> list[str]:
@@ -81,11 +81,12 @@ def table_rows(mission: Mission) -> list[tuple[str, str, int]]:
 
 def dispersed_lines(metrics: dict) -> list[str]:
     """The lines below the rocket's table on its dispersed flights; none where none were flown."""
-    if "dispersion" not in metrics:
+    if "dispersion" not in metrics or metrics["dispersed_starts"] == 0:
         return []
     n = metrics["dispersed_starts"]
     errors = ", ".join(f"{name} {metrics[f'dispersed_error_{name}']:.6f}" for name in ("median", "p95", "p99", "max"))
-    lines = [f"  {n} flights at dispersion {metrics['dispersion']:g}: ||error|| {errors}"]
+    flights = "healthy flights" if "failure" in metrics else "flights"
+    lines = [f"  {n} {flights} at dispersion {metrics['dispersion']:g}: ||error|| {errors}"]
     spreads = []
     for key, half in BOX.items():
         name, unit = key.rsplit("_", 1)
@@ -100,3 +101,22 @@ def dispersed_lines(metrics: dict) -> list[str]:
     mass = f"final mass {metrics['dispersed_mass_mean_kg']:.2f} kg on average, 1 % below"
     ends = f"{metrics['dispersed_dry']} ran dry, {metrics['dispersed_crashed']} crashed"
     return [*lines, f"    {mass} {metrics['dispersed_mass_p01_kg']:.2f} kg; {ends}"]
+
+
+def failure_lines(metrics: dict) -> list[str]:
+    """The lines below the rocket's table on its flights with a failure; none where none were flown."""
+    if not metrics.get("failure"):
+        return []
+    when = {"random": "from a random moment of a burn on", "ignition": "from the last stage's ignition on"}
+    loss = f"up to {metrics['failure']:.0%} of thrust lost {when[metrics['failure_time']]}"
+    n, savable = metrics["failure_starts"], metrics["failure_savable"]
+    lines = [f"  {n} flights with a failure, {loss}; {savable} of them can be saved"]
+    if "failure_saved_rate" in metrics:
+        errors = ", ".join(f"{name} {metrics[f'failure_error_{name}']:.6f}" for name in ("median", "p95"))
+        saved = f"{metrics['failure_saved_rate']:.2%} are saved, below {SUCCESS}"
+        lines.append(f"    of these {saved}; ||error|| {errors}")
+    if "failure_mass_short_mean_kg" in metrics:
+        best = "the optimum that knows of the failure from its strike on"
+        short = f"{metrics['failure_mass_short_mean_kg']:.2f} kg"
+        lines.append(f"    the saved end with {short} less on average than {best}")
+    return lines

@@ -4,26 +4,33 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from common.errors import BadInput
+from common.command_line import integer, number
+from common.errors import BadInput, refuse_unless
 from common.tasks import Interface
 from formats.track import Track
 from rocket import export
 from rocket.comparison import compare
+from rocket.dispersion import draw_vehicles
 from rocket.environment import flown_mission, fly_rocket
+from rocket.failure import FAILURE_TIMES, LARGEST_FAILURE, NEEDS_CUTOFF
 from rocket.metrics import (
     DISPERSED_STARTS,
     EQUATORIAL,
     SUCCESS,
+    chosen,
     decision_us,
     draws,
     evaluate_dispersed,
+    failure_metrics,
+    healthy,
     lowest_key,
     perigee_longitude,
     rocket_metrics,
 )
 from rocket.missions import ROCKETS, Mission
 from rocket.optimum import kept_reference, reached_optimum
-from rocket.report import report_rocket
+from rocket.report import report_failures, report_rocket
+from rocket.rescue import Failing, known_optima
 from rocket.table import table
 
 INTERIM_STARTS = 100  # dispersed flights of an evaluation during a training
@@ -31,7 +38,7 @@ INTERIM_STARTS = 100  # dispersed flights of an evaluation during a training
 
 @dataclass(frozen=True)
 class RocketTask:
-    """A mission in `ROCKETS`: one nominal flight and, with the option `dispersion`, many that differ."""
+    """A mission in `ROCKETS`: one nominal flight and, with the options `dispersion` and `failure`, many that differ."""
 
     env_id: str
     mission: Mission
@@ -47,19 +54,35 @@ class RocketTask:
 
     # --- flying and measuring
 
-    def reset_options(self, eval_seed: int, n: int, dispersion: float = 0.0, **env_options) -> dict:
-        if not dispersion:
+    def reset_options(
+        self, eval_seed: int, n: int, dispersion: float = 0.0, failure: float = 0.0, **env_options
+    ) -> dict:
+        if not dispersion and not failure:
             return {}
-        return {"draw": draws(self.flown_with(**env_options).mission.rocket, dispersion, eval_seed, n)}
+        return {"draw": draws(self.flown_with(**env_options).mission.rocket, dispersion, eval_seed, n, failure)}
 
     def optimum(self, eval_seed: int, n: int, **env_options) -> dict:
-        """The nominal flight's, whatever is drawn."""
-        return kept_reference(self.env_id, self.flown_with(**env_options).mission)
+        """The nominal flight's, whatever is drawn; what can be saved of failures is solved, too, and remembered."""
+        task = self.flown_with(**env_options)
+        failing = Failing.of(env_options)
+        if failing.failure:
+            known_optima(self.env_id, task.mission, failing, eval_seed, n)
+        return kept_reference(self.env_id, task.mission)
 
-    def evaluate(self, policy, eval_seed: int, n: int, reference=None, dispersion: float = 0.0, **env_options):
-        """Fly the nominal rocket once beside the optimum's flight; with `dispersion` also n dispersed flights.
+    def evaluate(
+        self,
+        policy,
+        eval_seed: int,
+        n: int,
+        reference=None,
+        dispersion: float = 0.0,
+        failure: float = 0.0,
+        failure_time: str = "random",
+        **env_options,
+    ):
+        """Fly the nominal rocket once beside the optimum's flight; with `dispersion` or `failure` also n that differ.
 
-        Without it seed and n are only noted. With the options `rocket` or `table_isp` the target and the optimum are
+        Without them seed and n are only noted. With the options `rocket` or `table_isp` the target and the optimum are
         those of that rocket, too. Metrics that are not finite (the apogee of a hyperbola) or have no meaning are left
         out.
         """
@@ -70,16 +93,28 @@ class RocketTask:
         metrics |= rocket_metrics(flight, reference, self.flown_with(**env_options).mission)
         arrays = {key: flight[key] for key in ("t", "u", "y", "reward")}
         arrays |= {f"{key}_reference": reference[key] for key in ("t", "u", "y")}
-        if dispersion:
-            of_all, ends = evaluate_dispersed(self.env_id, policy, eval_seed, n, dispersion, **env_options)
-            metrics, arrays = metrics | of_all, arrays | ends
+        if dispersion or failure:
+            failing = Failing(dispersion, failure, failure_time)
+            of_healthy, ends = evaluate_dispersed(self.env_id, policy, eval_seed, n, **failing._asdict(), **env_options)
+            metrics, arrays = metrics | of_healthy, arrays | ends
+            if failure:
+                metrics |= self.flown_with(**env_options).failures_measured(ends, failing, eval_seed)
         return metrics, arrays
 
-    def reported_metrics(self, metrics: dict, timed_policy=None, dispersion: float = 0.0, **env_options) -> dict:
-        """The mass beside the optimum's for the orbit that was reached; of dispersed flights a decision's time."""
+    def failures_measured(self, arrays: dict, failing: Failing, eval_seed: int) -> dict:
+        """The `failure...` metrics of the flights of a seed."""
+        rocket = self.mission.rocket
+        known = known_optima(self.env_id, self.mission, failing, eval_seed, len(arrays["draw"]))
+        reached = known.mass_at(arrays["final_error"], rocket)
+        dry_mass = draw_vehicles(rocket, failing.dispersion, arrays["draw"]).dry_mass
+        options = {"failure": float(failing.failure), "failure_time": failing.failure_time}
+        return options | failure_metrics(arrays, known.mass, reached, dry_mass)
+
+    def reported_metrics(self, metrics: dict, timed_policy=None, **env_options) -> dict:
+        """The mass beside the optimum's for the orbit that was reached; of flights that differ a decision's time."""
         found = self.mass_reached(metrics)
-        if dispersion and timed_policy is not None:
-            found["decision_us"] = decision_us(self.env_id, timed_policy, dispersion=dispersion, **env_options)
+        if has_draws(**env_options) and timed_policy is not None:
+            found["decision_us"] = decision_us(self.env_id, timed_policy, **env_options)
         return found
 
     def mass_reached(self, metrics: dict) -> dict:
@@ -101,20 +136,25 @@ class RocketTask:
 
     # --- the size of an evaluation, and what a run may not do
 
-    def default_flights(self, is_brief: bool, dispersion: float = 0.0, **env_options) -> int:
-        if dispersion:
+    def default_flights(self, is_brief: bool, **env_options) -> int:
+        if has_draws(**env_options):
             return INTERIM_STARTS if is_brief else DISPERSED_STARTS
         return 50 if is_brief else 1000  # noted alone: there is one start
 
-    def interim_flights(self, n: int, dispersion: float = 0.0, **env_options) -> int:
-        return min(n, INTERIM_STARTS) if dispersion else n
+    def interim_flights(self, n: int, **env_options) -> int:
+        return min(n, INTERIM_STARTS) if has_draws(**env_options) else n
 
     def remark_on_seed(self, eval_seed: int) -> str | None:
         return None  # draws of an evaluation come from another stream
 
-    def refusal(self, trains: bool, dispersion: float = 0.0, observe_phase: bool = True, **env_options):
-        if dispersion and trains and not observe_phase:
-            why = "not in a training with --dispersion: the nominal flight is looked up by the phase"
+    def choices(self) -> dict[str, tuple[str, ...]]:
+        return {"failure_time": FAILURE_TIMES}
+
+    def refusal(self, trains: bool, observe_phase: bool = True, failure: float = 0.0, **env_options):
+        if failure and not self.mission.cutoff:
+            return "failure", NEEDS_CUTOFF
+        if has_draws(failure=failure, **env_options) and trains and not observe_phase:
+            why = "not in a training with --dispersion or --failure: the nominal flight is looked up by the phase"
             return "no_observe_phase", why
         return None
 
@@ -139,11 +179,16 @@ class RocketTask:
             "dispersed_perigee_error_std_km": ("dispersed: perigee off, sigma (km)", ".2f"),
             "dispersed_box_rate": ("dispersed: in the box", ".1%"),
             "dispersed_mass_mean_kg": ("dispersed: final mass, mean (kg)", ".2f"),
+            "failure_saved_rate": ("failures: saved of the savable", ".1%"),
+            "failure_error_median": ("failures: ||error||, median", ".6f"),
+            "failure_error_p95": ("failures: ||error||, p95", ".6f"),
+            "failure_mass_short_mean_kg": ("failures: short of the optimum (kg)", ".2f"),
         }
 
-    def progress_keys(self, dispersion: float = 0.0, **env_options) -> list[str]:
+    def progress_keys(self, dispersion: float = 0.0, failure: float = 0.0, **env_options) -> list[str]:
         dispersed = ["dispersed_error_median", "dispersed_error_p95", "dispersed_box_rate"]
-        return ["error_norm", "mass_ratio", *(dispersed if dispersion else [])]
+        failed = ["failure_error_median", "failure_error_p95", "failure_saved_rate"]
+        return ["error_norm", "mass_ratio", *(dispersed if dispersion else []), *(failed if failure else [])]
 
     def headline(self, metrics: dict) -> str:
         """A figure's title: error and mass."""
@@ -163,10 +208,10 @@ class RocketTask:
         highest = max(metrics["max_altitude_km"], metrics["reference_max_altitude_km"])
         figures["trajectory.png"] = ascent_figure(self.mission, arrays, title)
         figures["orbit.png"] = orbit_figure(self.mission, arrays, title, highest)
-        if "dispersion" in metrics:
+        if "dispersed_box_rate" in metrics:
             inside = f"{metrics['dispersed_box_rate']:.1%} of {metrics['dispersed_starts']} flights inside the box"
             title = f"{self.env_id} at dispersion {metrics['dispersion']:g}: {inside}"
-            figures["dispersed.png"] = dispersed_figure(self.mission.rocket, {"policy": arrays}, title)
+            figures["dispersed.png"] = dispersed_figure(self.mission.rocket, flights_shown(arrays), title)
         return figures
 
     def training_figure(self, metrics: dict, curves: list[dict]):
@@ -186,7 +231,9 @@ class RocketTask:
 
     def required_arrays(self, metrics: dict) -> set[str]:
         names = {f"{key}{side}" for key in ("t", "u", "y") for side in ("", "_reference")} | {"reward"}
-        return names | ({"draw", "final_y", "final_error"} if "dispersion" in metrics else set())
+        if {"dispersion", "failure"} & metrics.keys():
+            names |= {"draw", "final_y", "final_error"}
+        return names | ({"failure"} if "failure" in metrics else set())
 
     def kept_arrays(self, arrays: dict) -> dict:
         return arrays
@@ -215,10 +262,35 @@ class RocketTask:
         return [("", local, [1.0, 0.3, 0.0]), (", dispersed", {**local, "dispersion": 1}, [1.0, 0.3, 0.0])]
 
     def add_arguments(self, parser) -> None:
-        """There are none."""
+        about = "what flights with failures up to this share of thrust can still reach, in place of the nominal optimum"
+        parser.add_argument("--failure", type=number(0, LARGEST_FAILURE), default=0.0, metavar="K", help=about)
+        parser.add_argument("--failure-time", choices=FAILURE_TIMES, default="random", help="default random")
+        parser.add_argument("--dispersion", type=number(0, 10), default=0.0, metavar="D", help="of those flights")
+        starts, at_first = integer(1, 100_000), DISPERSED_STARTS
+        parser.add_argument("--starts", type=starts, default=at_first, metavar="N", help=f"of them: default {at_first}")
+        parser.add_argument("--seed", type=integer(0, 2**31), default=0, metavar="S", help="of them: default 0")
 
     def baseline_command(self, args) -> tuple[dict, dict]:
-        return report_rocket(self.env_id)
+        if not args.failure:
+            return report_rocket(self.env_id)
+        refuse_unless(self.mission.cutoff, "--failure", args.failure, NEEDS_CUTOFF)
+        failing = Failing(args.dispersion, args.failure, args.failure_time)
+        return report_failures(self.env_id, failing, args.starts, args.seed)
 
     def fly_opponents(self, folder, **options) -> None:
         compare(self.env_id, folder, **options)
+
+
+def has_draws(dispersion: float = 0.0, failure: float = 0.0, **env_options) -> bool:
+    """Whether these options have flights differ from one another."""
+    return bool(dispersion or failure)
+
+
+def flights_shown(arrays: dict) -> dict[str, dict]:
+    """What the figure of dispersed flights shows: label -> arrays, healthy flights apart from the others."""
+    if "failure" not in arrays:
+        return {"policy": arrays}
+    ends = {key: arrays[key] for key in ("draw", "failure", "final_y", "final_error")}
+    is_healthy = healthy(ends)
+    shown = {"policy, healthy flights": is_healthy, "policy, flights with a failure": ~is_healthy}
+    return {label: chosen(ends, flights) for label, flights in shown.items() if flights.any()}

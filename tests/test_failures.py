@@ -180,7 +180,7 @@ def restart():
 def test_a_stage_that_burns_twice_keeps_its_schedule_and_its_coast(moment, strike, end):
     """It fails once: in its first burn, which ends at its time all the same, or in the second, never in the coast."""
     z = np.zeros((1, 16))
-    z[0, 12:] = 0.0, 0.9, moment, 0.5 / 0.3 * 0.3
+    z[0, 12:] = 0.0, 0.9, moment, 0.5
     vehicles = envs.draw_vehicles(restart(), 0.0, z, LARGEST)
     share = 0.15
     np.testing.assert_allclose(vehicles.failure[:, 0], [1, strike, share])

@@ -1,0 +1,219 @@
+"""The optimum that knows of a failure from the moment it strikes: whether a flight can be saved, and with what mass.
+
+Until the strike it is the optimum of the drawn vehicle, which expects no failure. From there on the remaining ascent is
+solved again, with the engines as they are left. Its last burn may go on below the dry mass: so there is an optimum
+nearly always, and a flight is savable where that ends above the dry mass.
+Reading order: one flight, many flights, those that are stored. CasADi and SciPy are imported only where they are used.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from concurrent.futures import ProcessPoolExecutor
+from functools import lru_cache
+from multiprocessing import get_context
+from typing import NamedTuple
+
+import numpy as np
+
+from common.errors import NoOptimum
+from common.files import DAMAGED_NPZ
+from rocket import guidance
+from rocket.dispersion import DISPERSION, Vehicles, draw_vehicles
+from rocket.metrics import draws
+from rocket.missions import Mission
+from rocket.optimum import RESULTS, kept_reference
+from rocket.orbits import target_axes, target_orbit
+from rocket.vehicle import Rocket
+
+
+class Failing(NamedTuple):
+    """The options of the environment that say which failures are drawn, and in which vehicles."""
+
+    dispersion: float = 0.0
+    failure: float = 0.0
+    failure_time: str = "random"
+
+    @classmethod
+    def of(cls, env_options: dict) -> Failing:
+        """Those among the options of an environment."""
+        return cls(**{name: env_options[name] for name in cls._fields if name in env_options})
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# One flight
+# ---------------------------------------------------------------------------------------------------------------------
+
+RELAXED_MASS = 0.5  # part of the dry mass at which the last burn ends at the latest
+
+
+def solve_rescue(job):
+    """The optimum of one flight, None where IPOPT finds none: job is (rocket, failing, z, guess), z (k + 4,) its draw.
+
+    Of a healthy flight that of `guidance.drawn_optima`, of another that of `rescued`.
+    """
+    rocket, failing, z, guess = job
+    orbit = target_orbit(rocket.target, rocket.mu)
+    healthy = guidance.solve_drawn((rocket, failing.dispersion, z, orbit, guess))
+    vehicle = draw_vehicles(rocket, failing.dispersion, z[None], failing.failure, failing.failure_time)
+    burn, moment, _ = vehicle.failure[:, 0]
+    # no failure, or one behind the cut-off or in the environment's last step, after which no direction is chosen
+    if healthy is None or burn < 0 or moment > healthy["final_time"] - rocket.dt:
+        return healthy
+    before = draw_vehicles(rocket, failing.dispersion, z[None])
+    try:
+        return rescued(rocket, vehicle, before, healthy, orbit, guidance.drawn_intervals(rocket, guess["t"][-1]))
+    except NoOptimum:
+        return None
+
+
+def rescued(rocket: Rocket, vehicle: Vehicles, before: Vehicles, healthy: dict, orbit, intervals) -> dict:
+    """The optimum of one vehicle that flies `healthy` until its failure strikes, and knows of it from there on.
+
+    `before` is the vehicle without the failure; `intervals` has a number for each burn. Returns what
+    `optimise_remaining` does of the time after the strike, with `healthy` and the `strike` (s) beside it. Raises
+    NoOptimum where IPOPT finds none.
+    """
+    strike = vehicle.failure[1, 0]
+    state = state_at(healthy, strike)
+    first = int((before.burn_end[:-1, 0] <= strike).sum())  # the burn in which it strikes
+    remaining = remaining_after(vehicle, strike, state, orbit)
+    # the guess is the healthy flight's rest: each burn stretched to its length now, and the last to what is lost of it
+    flow_before, flow_now = before.flow[len(before.burn_end) - 1, 0], remaining.flow[-1]
+    old = np.array([strike, *before.burn_end[first:-1, 0], healthy["final_time"]])
+    new = np.array([strike, *vehicle.burn_end[first:-1, 0], 0.0])
+    new[-1] = new[-2] + (old[-1] - old[-2]) * flow_before / flow_now
+    guess = {}
+    for t, values in (("t", "y"), ("t_u", "u")):
+        later = healthy[t] > min(strike, healthy[t][-2])
+        guess |= {t: np.interp(healthy[t][later], old, new), values: healthy[values][later]}
+    guess["t"], guess["y"] = np.append(strike, guess["t"]), np.vstack([state, guess["y"]])
+    found = guidance.optimise_remaining(rocket, remaining, guess, intervals[first:])
+    return found | {"healthy": healthy, "strike": strike}
+
+
+def state_at(plan: dict, time: float) -> np.ndarray:
+    """r (m) and v (m/s), (6,), of an optimum of `optimise_remaining` at a time: its own polynomial of that interval."""
+    from scipy.interpolate import BarycentricInterpolator
+
+    size = len(guidance.GAUSS_POINTS) + 1  # the interval's begin, and its points
+    last = len(plan["t"]) - 1 - size
+    begin = min(size * ((np.searchsorted(plan["t"], time, side="right") - 1) // size), last)
+    nodes = slice(begin, begin + size)
+    return BarycentricInterpolator(plan["t"][nodes], plan["y"][nodes])(time)
+
+
+def remaining_after(vehicle: Vehicles, strike: float, state: np.ndarray, orbit) -> guidance.RemainingAscent:
+    """What is left of the ascent of one vehicle from its failure on, its last burn relaxed."""
+    columns = (vehicle.end, vehicle.thrust, vehicle.flow, vehicle.dropped)
+    end, thrust, flow, dropped = (column[:-1, 0] for column in columns)  # the arc without thrust is left out
+    lost = flow * np.diff(end, prepend=0.0) + dropped
+    mass = vehicle.mass[0] - np.append(0.0, np.cumsum(lost)[:-1])
+    left = end > strike
+    begin = max(strike, end[-2])  # of the last arc
+    end = end[left]
+    end[-1] = begin + (mass[-1] - RELAXED_MASS * vehicle.dry_mass[0]) / flow[-1]
+    air = (vehicle.drag[0], vehicle.wind[0, 0], vehicle.wind[1, 0])
+    h, e = orbit
+    return guidance.RemainingAscent(strike, state, end, thrust[left], flow[left], mass[left], h, e, air)
+
+
+def directions_at(optimum: dict, times: np.ndarray) -> np.ndarray:
+    """An optimum's directions (m, 3) at `times` (m,) in s: from the strike on those that know of the failure."""
+    if "strike" not in optimum:
+        return guidance.directions_at(optimum, times)
+    before, after = (guidance.directions_at(plan, times) for plan in (optimum["healthy"], optimum))
+    return np.where((times < optimum["strike"])[:, None], before, after)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Many flights
+# ---------------------------------------------------------------------------------------------------------------------
+
+FLIGHTS_PER_PROCESS = 50  # a process takes two seconds to start, a flight a third of one
+
+
+def failing_optima(
+    env_id: str, mission: Mission, failing: Failing, z: np.ndarray, processes: int | None = None
+) -> list:
+    """The optima of draws z (n, k + 4), as `solve_rescue` has them.
+
+    Shared out to `processes` (default: by the number of draws, at most the machine's), which changes only the time.
+    """
+    guess = guidance.guess_of(kept_reference(env_id, mission))
+    jobs = [(mission.rocket, failing, row, guess) for row in z]
+    if processes is None:
+        processes = max(1, min(os.cpu_count() or 1, len(jobs) // FLIGHTS_PER_PROCESS))
+    if processes == 1:
+        return [solve_rescue(job) for job in jobs]
+    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
+        return list(pool.map(solve_rescue, jobs, chunksize=-(-len(jobs) // (4 * processes))))
+
+
+class Known(NamedTuple):
+    """What the optima of n flights leave that know of a failure from its strike on."""
+
+    mass: np.ndarray  # (n,) kg in the target orbit; NaN of healthy flights, and where no optimum was found
+    price: np.ndarray  # (n, 5) kg that a unit of each of the numbers of `orbit_defect` saves, NaN as the mass
+
+    def first(self, n: int) -> Known:
+        """Of the first n flights."""
+        return Known(*(values[:n] for values in self))
+
+    def mass_at(self, error: np.ndarray, rocket: Rocket) -> np.ndarray:
+        """The masses (n,) for the orbits of these terminal errors (n, 6), to first order.
+
+        Below an error of 0.001 within 0.1 kg, at 0.01 within 1.5 kg too much, of fourteen optima to orbits reached.
+        """
+        in_plane = error[:, 3:] @ target_axes(rocket)[:2].T
+        return self.mass + (self.price * np.hstack([error[:, :3], in_plane])).sum(axis=1)
+
+
+def solve_known(env_id: str, mission: Mission, failing: Failing, z: np.ndarray, processes: int | None = None) -> Known:
+    """`Known` of draws z (n, k + 4)."""
+    vehicles = draw_vehicles(mission.rocket, failing.dispersion, z, failing.failure, failing.failure_time)
+    has_failed = np.flatnonzero(vehicles.failure[0] >= 0)
+    known = Known(np.full(len(z), np.nan), np.full((len(z), 5), np.nan))
+    for k, optimum in zip(has_failed, failing_optima(env_id, mission, failing, z[has_failed], processes)):
+        if optimum:
+            known.mass[k], known.price[k] = optimum["final_mass"], optimum["orbit_price"]
+    return known
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# What is known of the draws of a seed: stored, or solved once
+# ---------------------------------------------------------------------------------------------------------------------
+
+STORED = RESULTS / "failure_optima"
+
+
+def about(env_id: str, mission: Mission, failing: Failing, eval_seed: int) -> str:
+    """What the optima of a seed's draws depend on: a stored file of the same words fits."""
+    options = " ".join(f"{name} {value}" for name, value in failing._asdict().items())
+    return f"{env_id} {options} eval_seed {eval_seed} {DISPERSION} {mission.rocket}"
+
+
+@lru_cache(maxsize=8)
+def known_optima(env_id: str, mission: Mission, failing: Failing, eval_seed: int, n: int) -> Known:
+    """`solve_known` of the first n draws of a seed, read from results/ where it is stored there."""
+    known = stored_optima(about(env_id, mission, failing, eval_seed), n)
+    if known is None:
+        print(f"{env_id}: solving what can be saved of {n} flights with failures, once", file=sys.stderr, flush=True)
+        z = draws(mission.rocket, failing.dispersion, eval_seed, n, failing.failure)
+        known = solve_known(env_id, mission, failing, z)
+    for values in known:
+        values.flags.writeable = False
+    return known
+
+
+def stored_optima(words: str, n: int) -> Known | None:
+    """Of the first n flights, from the file in results/ that is `about` these words; None where there is none."""
+    for path in sorted(STORED.glob("*.npz")):
+        try:
+            with np.load(path) as file:
+                if str(file["about"]) == words and len(file["mass"]) >= n:
+                    return Known(file["mass"], file["price"]).first(n)
+        except (OSError, KeyError, *DAMAGED_NPZ):
+            continue
+    return None
