@@ -192,7 +192,7 @@ def draw_vehicles(
         return vehicles
     whole = [[(group.number, group.engine)] for group in groups]
     of_groups = (np.array([none + of(parts) for parts in whole]) for of in (thrust, flow))
-    return struck(vehicles, groups, losses, losses.strike(groups, end, seconds_lit), *of_groups)
+    return struck(vehicles, groups, losses, losses.strike(groups, end), *of_groups)
 
 
 def struck(vehicles: Vehicles, groups, losses: Losses, strike: np.ndarray, thrust: np.ndarray, flow: np.ndarray):

@@ -1,9 +1,9 @@
 """A hidden loss of thrust: in half of the flights one engine type gives less from a moment of its burn on.
 
-Thrust and propellant flow fall together, so that the engines burn for longer; what is known of a loss is how the flight
-goes. The engines that may fail are the groups of `engine_groups`, types that are dropped together: of the paper's
-rocket the six boosters, the three, stage 1 and stage 2. Each burns once, from its ignition until its propellant is
-spent, and all are equally likely to fail.
+Thrust and propellant flow fall together, so the engines burn for longer. Nothing announces it but the flight itself. The
+engines that may fail are the groups of `engine_groups`, of one type and dropped together: of the paper's rocket the six
+boosters, the three, stage 1 and stage 2. All are equally likely to fail, each from a moment between its ignition and
+its burn-out.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ FAILURE_PROBABILITY = 0.5
 # numbers from 0 to 1, all alike likely; a flight fails where the first is below `FAILURE_PROBABILITY`
 FAILURE_DRAW = ("failure", "failed_burn", "moment", "share")
 HEALTHY_DRAW = (1.0, 0.0, 0.0, 0.0)
+NEEDS_CUTOFF = "must be 0 where flights end at a fixed time: engines that burn for longer need an id with cut-off"
 
 
 def check_failure(failure: float, failure_time: str, cutoff: bool):
@@ -30,9 +31,6 @@ def check_failure(failure: float, failure_time: str, cutoff: bool):
     allowed = f"must be one of {', '.join(FAILURE_TIMES)}"
     refuse_unless(failure_time in FAILURE_TIMES, "failure_time", repr(failure_time), allowed)
     refuse_unless(cutoff or not failure, "failure", failure, NEEDS_CUTOFF)
-
-
-NEEDS_CUTOFF = "must be 0 where flights end at a fixed time: engines that burn for longer need an id with cut-off"
 
 
 class Losses(NamedTuple):
@@ -54,11 +52,8 @@ class Losses(NamedTuple):
         after = self.after[g]
         return np.minimum(seconds, after) + np.maximum(seconds - after, 0.0) * (1 - self.share[g])
 
-    def strike(self, groups, end: np.ndarray, seconds_lit: np.ndarray) -> np.ndarray:
-        """When the failures strike, (N,) s after lift-off, infinite where none does.
-
-        end (B, N) s: the burns' ends; seconds_lit (G, N): what `burn_ends` returns beside them.
-        """
+    def strike(self, groups, end: np.ndarray) -> np.ndarray:
+        """When the failures strike, (N,) s after lift-off, infinite where none does; end (B, N) s: of the burns."""
         begin = np.vstack([np.zeros_like(end[:1]), end[:-1]])
         strike = np.full(end.shape[1], np.inf)
         for g, group in enumerate(groups):

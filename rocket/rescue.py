@@ -46,6 +46,7 @@ class Failing(NamedTuple):
 # ---------------------------------------------------------------------------------------------------------------------
 
 RELAXED_MASS = 0.5  # part of the dry mass at which the last burn ends at the latest
+MESHES = (1, 2, 0.5)  # times a healthy flight's intervals, tried in turn: on few early strikes IPOPT gives up
 
 
 def solve_rescue(job):
@@ -62,10 +63,14 @@ def solve_rescue(job):
     if healthy is None or burn < 0 or moment > healthy["final_time"] - rocket.dt:
         return healthy
     before = draw_vehicles(rocket, failing.dispersion, z[None])
-    try:
-        return rescued(rocket, vehicle, before, healthy, orbit, guidance.drawn_intervals(rocket, guess["t"][-1]))
-    except NoOptimum:
-        return None
+    intervals = guidance.drawn_intervals(rocket, guess["t"][-1])
+    for factor in MESHES:
+        mesh = tuple(max(round(factor * number), 1) for number in intervals)
+        try:
+            return rescued(rocket, vehicle, before, healthy, orbit, mesh)
+        except NoOptimum:
+            continue
+    return None
 
 
 def rescued(rocket: Rocket, vehicle: Vehicles, before: Vehicles, healthy: dict, orbit, intervals) -> dict:

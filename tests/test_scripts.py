@@ -160,7 +160,7 @@ def test_flags_of_the_interface():
     fields = {script: {field.name for field in dataclasses.fields(script.Args)} for script in MODULES}
     assert all(set(words.split()) <= names for names in fields.values())
     small = {"log_radius", "observe_velocity"}
-    rocket = {"guidance", "mass_weight", "dispersion", "observe_draw", "observe_mass"}
+    rocket = {"guidance", "mass_weight", "dispersion", "observe_draw", "observe_mass", "failure", "failure_time"}
     assert fields[DI] == fields[VDP] == fields[ROCKET] - rocket | small
 
 
