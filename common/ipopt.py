@@ -10,7 +10,7 @@ from contextlib import contextmanager
 
 PATIENCE = 5.0  # s without a line
 LEAST = 0.1  # s: less is none; IPOPT refuses a limit of 0
-limit = {"seconds": 120}  # of a rocket's solve, all its tries; `python baselines.py ID --solve-seconds` sets it
+limit = {"seconds": 120.0}  # of a rocket's solve, all its tries; `python baselines.py ID --solve-seconds` sets it
 
 
 class SolveClock:

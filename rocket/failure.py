@@ -1,9 +1,9 @@
 """A hidden loss of thrust: in half of the flights one engine type gives less from a moment of its burn on.
 
-Thrust and propellant flow fall together, so the engines burn for longer. Nothing announces it but the flight itself. The
-engines that may fail are the groups of `engine_groups`, of one type and dropped together: of the paper's rocket the six
-boosters, the three, stage 1 and stage 2. All are equally likely to fail, each from a moment between its ignition and
-its burn-out.
+Thrust and propellant flow fall together, so the engines burn for longer. Nothing announces it but the flight itself.
+The engines that may fail are the groups of `engine_groups`, of one type and dropped together: of the paper's rocket the
+six boosters, the three, stage 1 and stage 2. All are equally likely to fail, each from a moment between its ignition
+and its burn-out.
 """
 
 from __future__ import annotations

@@ -10,15 +10,14 @@ from __future__ import annotations
 
 import os
 import sys
-from concurrent.futures import ProcessPoolExecutor
 from functools import lru_cache
-from multiprocessing import get_context
 from typing import NamedTuple
 
 import numpy as np
 
 from common.errors import NoOptimum
 from common.files import DAMAGED_NPZ
+from common.workers import Workers
 from rocket import guidance
 from rocket.dispersion import DISPERSION, Vehicles, draw_vehicles
 from rocket.metrics import draws
@@ -150,10 +149,8 @@ def failing_optima(
     jobs = [(mission.rocket, failing, row, guess) for row in z]
     if processes is None:
         processes = max(1, min(os.cpu_count() or 1, len(jobs) // FLIGHTS_PER_PROCESS))
-    if processes == 1:
-        return [solve_rescue(job) for job in jobs]
-    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
-        return list(pool.map(solve_rescue, jobs, chunksize=-(-len(jobs) // (4 * processes))))
+    with Workers(processes) as workers:
+        return workers.map(solve_rescue, jobs)
 
 
 class Known(NamedTuple):
