@@ -39,6 +39,7 @@ from common.curves import read_curve
 from common.errors import BadInput, NoOptimum
 from common.evaluations import write_evaluation
 from common.tasks import Task, task_of
+from common.tasks import env_ids as known_ids
 
 gc.freeze()  # what was imported is never garbage; looking through it took a fifth of the time of --help
 
@@ -242,7 +243,10 @@ def take_checkpoint_args(args, kind, typed, env_options, buffers):
 def check_values(args, env_ids):
     """Refuse a number out of its range, and a word that is not among those of its flag."""
     check_word(args, "env_id", env_ids)
-    for name, words in {"recipe": RECIPE_WORDS, **task_of(args.env_id).choices()}.items():
+    choices = {"recipe": RECIPE_WORDS}
+    if args.env_id in known_ids():  # of another one `check_buffers` says what is missing
+        choices |= task_of(args.env_id).choices()
+    for name, words in choices.items():
         check_word(args, name, words)
     kinds = get_type_hints(type(args), include_extras=True)
     for name, value in vars(args).items():
