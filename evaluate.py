@@ -5,10 +5,11 @@
     python evaluate.py figures results/di             # redraw its figures and print its table (a run folder works too)
     python evaluate.py animate results/di             # and its figures/animation.gif
     python evaluate.py opponents results/rocket_cutoff     # classical guidance on its policy's dispersed flights
+    python evaluate.py page results/rocket_dispersed       # one HTML file in which the policy flies in a browser
     python evaluate.py export results/rocket_cutoff --onnx policy.onnx     # the policy, or its flights, for other tools
 
 What is measured, printed and drawn of a problem is its family's: `phased/` and `rocket/`. Reading order: evaluation,
-results folders, exports, command line.
+results folders, exports, pages, command line.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ from formats.columns import csv_bytes
 from formats.czml import czml_bytes
 from formats.oem import oem_bytes
 from formats.policy import onnx_bytes
+from pages.assemble import html_bytes
 
 EPOCH = datetime(2026, 1, 1, tzinfo=UTC)  # of an exported lift-off
 LAUNCH_LONGITUDE = -80.6  # degrees east: Cape Canaveral
@@ -129,7 +131,7 @@ def keep_excerpt(path, task):
 def of_another_policy(folder) -> list[str]:
     """What a folder holds of the policy that it ships, beside the three files: it would look current."""
     figures = [path for path in (folder / "figures").glob("*") if path.is_file()]
-    return ["opponents.json", "opponents.npz", *(f"figures/{path.name}" for path in figures)]
+    return ["opponents.json", "opponents.npz", "page.html", *(f"figures/{path.name}" for path in figures)]
 
 
 def move(staged, folder, last, replaced):
@@ -230,6 +232,26 @@ def export(folder, targets: dict[str, Path], epoch: datetime = EPOCH, launch_lon
 
 
 # ---------------------------------------------------------------------------------------------------------------------
+# Pages
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def page(folder, target=None, launch_longitude: float = LAUNCH_LONGITUDE) -> Path:
+    """Write the page of a results or run folder, in which its policy flies in a browser; returns its path.
+
+    `target` is page.html in the folder where it is not given; the longitude (degrees east) is a rocket's. BadInput
+    where there is no page of such an environment or policy.
+    """
+    folder = Path(folder)
+    target = Path(target or folder / "page.html")
+    metrics, arrays = read_evaluation(folder)
+    checkpoint = read_checkpoint(folder / "agent.safetensors", {"num_heads": int, "memory_length": int}, flag="")
+    found = task_of(metrics["env_id"]).page(metrics, arrays, checkpoint, launch_longitude)
+    write_bytes(target, html_bytes(found))
+    return target
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 # Command line
 # ---------------------------------------------------------------------------------------------------------------------
 
@@ -278,6 +300,11 @@ def export_command(args):
         print(path)
 
 
+def page_command(args):
+    path = page(args.folder, args.out, args.launch_longitude)
+    print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")
+
+
 def print_tables(folder: Path):
     """A results or run folder's table, and that of its seeds."""
     metrics = read_json(folder / "eval.json")
@@ -291,6 +318,7 @@ COMMANDS = {
     "animate": animate_command,
     "opponents": opponents_command,
     "export": export_command,
+    "page": page_command,
 }
 FORMATS = {
     "onnx": "one step of the policy, memory in and out",
@@ -339,6 +367,11 @@ def parse_args(argv=None):
     moment = f"lift-off of --oem and --czml, UTC: default {EPOCH:%Y-%m-%dT%H:%M:%S}"
     command.add_argument("--epoch", type=utc, default=EPOCH, metavar="TIME", help=moment)
     site = f"of the launch site, degrees east: default {LAUNCH_LONGITUDE}"
+    command.add_argument("--launch-longitude", type=longitude, default=LAUNCH_LONGITUDE, metavar="L", help=site)
+    command = commands.add_parser("page", help="write one HTML file in which the policy flies in a browser")
+    command.add_argument("folder", type=Path, help="results/<name> or runs/...")
+    command.add_argument("--out", type=output_file, metavar="FILE", help="default: page.html in the folder")
+    site = f"of a rocket's launch site, degrees east: default {LAUNCH_LONGITUDE}"
     command.add_argument("--launch-longitude", type=longitude, default=LAUNCH_LONGITUDE, metavar="L", help=site)
     return parser.parse_args(argv)
 

@@ -126,6 +126,9 @@ class BatchedTask(SampledTask):
     def track(self, arrays: dict):
         raise BadInput(f"the env_id is {self.env_id}; for OEM and CZML it must be a rocket's")
 
+    def page(self, metrics: dict, arrays: dict, checkpoint: dict, launch_longitude: float):
+        raise BadInput(f"the env_id is {self.env_id}; a page is of a rocket or of a small problem")
+
     # --- commands
 
     def speed_cases(self) -> list[tuple[str, dict, list | None]]:

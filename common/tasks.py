@@ -122,7 +122,7 @@ class Task(Protocol):
         """The arrays that a results folder keeps."""
         ...
 
-    # --- what is taken along (`python evaluate.py export`)
+    # --- what is taken along (`python evaluate.py export`, `page`)
 
     def interface(self, **env_options) -> Interface:
         """Names and units of what a policy observes and commands."""
@@ -138,6 +138,13 @@ class Task(Protocol):
 
     def track(self, arrays: dict) -> Any:
         """The flight around the Earth, a `formats.track.Track`; BadInput where it is none."""
+        ...
+
+    def page(self, metrics: dict, arrays: dict, checkpoint: dict, launch_longitude: float) -> Any:
+        """The flight in the browser, a `pages.assemble.Page`; BadInput where there is none.
+
+        `checkpoint` is what `read_checkpoint` returns. The longitude is a rocket's.
+        """
         ...
 
     # --- commands

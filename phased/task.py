@@ -10,9 +10,11 @@ import numpy as np
 from common.command_line import integer
 from common.errors import BadInput
 from common.tasks import Interface, SampledTask
+from pages.assemble import Page
 from phased import export
 from phased.environment import fly
 from phased.metrics import flight_metrics, near_origin_metrics, ratio_metrics
+from phased.page import page as problem_page
 from phased.problem import Problem, flights_of_seed
 from phased.table import table
 
@@ -147,6 +149,9 @@ class PhasedTask(SampledTask):
 
     def track(self, arrays: dict):
         raise BadInput(f"the env_id is {self.env_id}; for OEM and CZML it must be a rocket's")
+
+    def page(self, metrics: dict, arrays: dict, checkpoint: dict, launch_longitude: float) -> Page:
+        return problem_page(self.problem, arrays, checkpoint)
 
     # --- commands
 

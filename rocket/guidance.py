@@ -101,36 +101,65 @@ def linearise_flight(mission: Mission, flight: dict, axes):
     return AB[..., :6], AB[..., 6:]
 
 
+def error_jacobian(rocket: Rocket, y):
+    """Derivatives of the terminal error (6, 6) and of the specific energy (6,) by r, v of a state y (7,)."""
+    h = np.repeat([10.0, 0.01], 3)
+    states = y[:6] + np.concatenate([np.diag(h), -np.diag(h)])
+    values = np.column_stack([terminal_error(states, rocket), specific_energy(states.T, rocket.mu)])  # (12, 7)
+    *error, energy = ((values[:6] - values[6:]) / (2 * h[:, None])).T
+    return np.array(error), energy
+
+
 def cutoff_jacobian(rocket: Rocket, y, rate):
     """Derivative (6, 6) of the terminal error at the cut-off by r, v of a state y (7,) that moves at `rate` (6,).
 
     The engine stops at the target's energy, whenever that is: dt = -E_x dx / (E_x rate) later than planned. What a
     state is ahead or behind along the trajectory costs nothing, only what it is beside it.
     """
-    h = np.repeat([10.0, 0.01], 3)
-    states = y[:6] + np.concatenate([np.diag(h), -np.diag(h)])
-    values = np.column_stack([terminal_error(states, rocket), specific_energy(states.T, rocket.mu)])  # (12, 7)
-    *error, energy = ((values[:6] - values[6:]) / (2 * h[:, None])).T
-    return np.array(error) @ (np.eye(6) - np.outer(rate, energy) / (energy @ rate))
+    error, energy = error_jacobian(rocket, y)
+    return error @ (np.eye(6) - np.outer(rate, energy) / (energy @ rate))
 
 
 def lqr_gains(mission: Mission, flight: dict, steering_weight: float = STEERING_WEIGHT):
     """Gains (K, 2, 6) of da_k = -G_k dx_k and the axes (K, 2, 3) of the angles, by the backward Riccati recursion.
 
-    Minimises |terminal error at the cut-off|^2 + sum of R dt |da|^2 along the linearised flight (e.g. Anderson and
-    Moore, Optimal Control, 1990). States on the way have no weight: only the end counts. Nor has the mass, which near
-    the heaviest flight depends on the steering in second order alone; R keeps that small.
+    Minimises |terminal error at the cut-off, or at the fixed time|^2 + sum of R dt |da|^2 along the linearised flight
+    (e.g. Anderson and Moore, Optimal Control, 1990). States on the way have no weight: only the end counts. Nor has the
+    mass, which near the heaviest flight depends on the steering in second order alone; R keeps that small.
     """
     axes = normal_axes(flight["u"])
     A, B = linearise_flight(mission, flight, axes)
     last, dt = flight["y"][-2:], np.diff(flight["t"])
-    C = cutoff_jacobian(mission.rocket, last[1], (last[1] - last[0])[:6] / dt[-1])
+    if mission.cutoff:
+        C = cutoff_jacobian(mission.rocket, last[1], (last[1] - last[0])[:6] / dt[-1])
+    else:
+        C, _ = error_jacobian(mission.rocket, last[1])
     P, gains = C.T @ C, np.empty((len(B), 2, 6))
     for k in reversed(range(len(B))):
         gains[k] = np.linalg.solve(steering_weight * dt[k] * np.eye(2) + B[k].T @ P @ B[k], B[k].T @ P @ A[k])
         P = A[k].T @ P @ (A[k] - B[k] @ gains[k])
         P = (P + P.T) / 2
     return gains, axes
+
+
+class Tracked(NamedTuple):
+    """A flight of K steps and what LQR needs to fly beside it."""
+
+    y: np.ndarray  # (K+1, 7)
+    u: np.ndarray  # (K, 3)
+    gains: np.ndarray  # (K, 2, 6)
+    axes: np.ndarray  # (K, 2, 3)
+    ignition: int  # the step in which the last burn begins
+    energy: np.ndarray  # (K+1 - ignition,) J/kg from there on, as it never falls
+
+
+def tracked(mission: Mission, flight: dict, steering_weight: float = STEERING_WEIGHT) -> Tracked:
+    """A flight (t, u, y) of a mission with its gains."""
+    (gains, axes), y, u = lqr_gains(mission, flight, steering_weight), flight["y"], flight["u"]
+    gains[-1], axes[-1] = gains[-2], axes[-2]  # the last step is cut short: its gain would be far too large for a whole
+    ignition = int(np.searchsorted(flight["t"], mission.rocket.last_ignition))
+    energy = np.maximum.accumulate(specific_energy(y[ignition:].T, mission.rocket.mu))
+    return Tracked(y, u, gains, axes, ignition, energy)
 
 
 def tvlqr(env_id: str, by_energy: bool = False, steering_weight: float = STEERING_WEIGHT):
@@ -142,11 +171,8 @@ def tvlqr(env_id: str, by_energy: bool = False, steering_weight: float = STEERIN
     others than the reported: median ||error|| by time and by energy 2.5e-5 and 1.8e-5 with R = 1e-7, 1.7e-5 and 1.4e-5
     with 1e-8, 1.9e-5 and 1.3e-5, at a greater p95, with 1e-9; with a tilt of 0.3 rad the same.
     """
-    mission, flight = ROCKETS[env_id], nominal_optimum(env_id)
-    (gains, axes), y, u = lqr_gains(mission, flight, steering_weight), flight["y"], flight["u"]
-    gains[-1], axes[-1] = gains[-2], axes[-2]  # the last step is cut short: its gain would be far too large for a whole
-    ignition = int(np.searchsorted(flight["t"], mission.rocket.last_ignition))
-    energy = np.maximum.accumulate(specific_energy(y[ignition:].T, mission.rocket.mu))
+    mission = ROCKETS[env_id]
+    y, u, gains, axes, ignition, energy = tracked(mission, nominal_optimum(env_id), steering_weight)
     phi_last = min(len(mission.rocket.burns) - 1, 1)  # as observed in the last burn
 
     def policy(obs, t):

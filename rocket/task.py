@@ -8,6 +8,7 @@ from common.command_line import integer, number
 from common.errors import BadInput, refuse_unless
 from common.tasks import Interface
 from formats.track import Track
+from pages.assemble import Page
 from rocket import export
 from rocket.comparison import compare
 from rocket.dispersion import draw_vehicles
@@ -29,6 +30,7 @@ from rocket.metrics import (
 )
 from rocket.missions import ROCKETS, Mission
 from rocket.optimum import kept_reference, reached_optimum
+from rocket.page import page as rocket_page
 from rocket.report import report_failures, report_rocket
 from rocket.rescue import Failing, known_optima
 from rocket.table import table
@@ -253,6 +255,9 @@ class RocketTask:
 
     def track(self, arrays: dict) -> Track:
         return export.earth_track(self.env_id, self.mission.rocket, arrays)
+
+    def page(self, metrics: dict, arrays: dict, checkpoint: dict, launch_longitude: float) -> Page:
+        return rocket_page(self.env_id, self.mission, metrics, arrays, checkpoint, launch_longitude)
 
     # --- commands
 

@@ -1,0 +1,144 @@
+"""What a rocket's page needs of Python: constants of vehicle, Earth and target, the policy, the optimum and its gains.
+
+pages/rocket_physics.js and pages/rocket_laws.js read them by these names; SI units.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from pages.assemble import Page, network
+from rocket.dispersion import (
+    DISPERSION,
+    WIND_ALTITUDE,
+    WIND_DEPTH,
+    check_drawable,
+    draw_names,
+    draw_sigmas,
+    draw_vehicles,
+)
+from rocket.guidance import tracked
+from rocket.missions import Mission
+from rocket.orbits import target_axes, target_orbit
+from rocket.policy_constants import DIFFERENCES
+from rocket.vehicle import EngineGroup, Rocket, engine_groups
+
+OPTIONS = {"observe_phase": True, "observe_draw": False, "observe_mass": False}  # that a policy was trained with
+SLIDER_SIGMAS = 6  # how far a slider goes, in standard deviations of a draw
+SEEN = 8 + 3 + 2 + 12  # features but for the phase's, the draw's and the differences: `features` of the script
+
+
+def page(env_id: str, mission: Mission, metrics: dict, arrays: dict, checkpoint: dict, launch_longitude: float) -> Page:
+    """The page of a policy: the nominal flight beside the optimum, and all that flies anew in the browser.
+
+    BadInput where no vehicle can be drawn of the table, or the policy has other features.
+    """
+    rocket = mission.rocket
+    check_drawable(rocket)
+    options = {name: checkpoint["args"].get(name, default) for name, default in OPTIONS.items()}
+    scores = len(draw_names(rocket)) if options["observe_draw"] else 0
+    optimum = {key: arrays[f"{key}_reference"] for key in ("t", "u", "y")}
+    policy = network(checkpoint, SEEN + len(rocket.burns) + scores + len(DIFFERENCES))
+    dispersion = checkpoint["args"].get("dispersion", 0.0)
+    data = {
+        "env_id": env_id,
+        "launch_longitude": launch_longitude,
+        "rocket": constants(mission, dispersion),
+        "sliders": sliders(rocket),
+        "policy": policy | {"options": options},
+        "optimum": {"t": optimum["t"]} | tracked(mission, optimum)._asdict(),
+        "python": {key: metrics[key] for key in ("error_norm", "final_mass_kg", "final_time_s")},
+    }
+    return Page("ascent", f"{env_id}: fly it", data)
+
+
+def constants(mission: Mission, dispersion: float) -> dict:
+    """Everything that the physics reads."""
+    rocket = mission.rocket
+    h_target, e_target = target_orbit(rocket.target, rocket.mu)
+    return {
+        **{name: getattr(rocket, name) for name in ("mu", "Re", "omega_e", "rho0", "H", "Cd", "S", "dt", "end_time")},
+        **{name: getattr(rocket, name) for name in ("payload", "dry_mass", "target_energy", "body")},
+        "wind_altitude": WIND_ALTITUDE,
+        "wind_depth": WIND_DEPTH,
+        "cutoff": mission.cutoff,
+        "ends_at_burn_out": mission.cutoff and rocket.end_time == rocket.burns[-1].end,
+        "x0": rocket.x0.tolist(),
+        "h_target": h_target.tolist(),
+        "e_target": e_target.tolist(),
+        "axes": target_axes(rocket).tolist(),
+        "a": rocket.a,
+        "e": rocket.e,
+        "burns": [
+            {"end": burn.end, "coast": burn.is_coast, "thrust": burn.thrust, "flow": burn.flow(rocket.table_isp)}
+            for burn in rocket.burns
+        ],
+        "groups": [group_constants(rocket, group) for group in engine_groups(rocket)],
+        "seen_mass": seen_mass(rocket),
+        "scores": [
+            {"of": slider(name), "sigma": dispersion * sigma}
+            for name, sigma in zip(draw_names(rocket), draw_sigmas(rocket))
+        ],
+    }
+
+
+def group_constants(rocket: Rocket, group: EngineGroup) -> dict:
+    """Engines that are dropped together, numbers of one of them."""
+    engine = group.engine
+    engines = "engine" if group.number == 1 else "engines"
+    return {
+        "name": f"{group.number:g} {engines} until {rocket.burns[group.dropped_after].end:g} s",
+        "number": group.number,
+        "thrust": engine.thrust,
+        "flow": engine.flow(rocket.table_isp),
+        "propellant": engine.propellant,
+        "dry_mass": engine.total_mass - engine.propellant,
+        "dropped_after": group.dropped_after,
+        "burns": sorted(group.burns),
+        "seconds_lit": group.seconds_lit,
+        "seconds_full": group.seconds_full if math.isfinite(group.seconds_full) else None,
+    }
+
+
+def slider(score: str) -> str:
+    """The slider of the page that moves a score of a draw; "" where none does."""
+    of_all_engines = "thrust" if score.startswith("burn_rate") else ""
+    named = {"payload": "payload", "drag": "drag", "wind_east": "windEast", "wind_north": "windNorth"}
+    return named.get(score, of_all_engines)
+
+
+def sliders(rocket: Rocket) -> list[dict]:
+    """The page's sliders: what they change (`vehicleOf` of pages/rocket_physics.js), by how much, and sigma of a draw.
+
+    Values are `unit` times `scale`: 1 % is 0.01. None moves the payload by more than it is.
+    """
+    rows = [
+        ("thrust", "thrust, all engines", "%", 0.01, DISPERSION.burn_rate, 0.1, math.inf),
+        ("drag", "drag", "%", 0.01, DISPERSION.drag, 1.0, 1.0),
+        ("windEast", "wind to the east", "m/s", 1.0, DISPERSION.wind, 1.0, math.inf),
+        ("windNorth", "wind to the north", "m/s", 1.0, DISPERSION.wind, 1.0, math.inf),
+        ("payload", "payload", "kg", 1.0, DISPERSION.payload, 1.0, rocket.payload),
+    ]
+    return [
+        {
+            "name": name,
+            "label": label,
+            "unit": unit,
+            "scale": scale,
+            "sigma": sigma / scale,
+            "step": step,
+            "most": step * math.floor(min(SLIDER_SIGMAS * sigma, most) / scale / step + 1e-9),
+        }
+        for name, label, unit, scale, sigma, step, most in rows
+    ]
+
+
+def seen_mass(rocket: Rocket) -> list[float]:
+    """The flight computer's mass at the beginning of each burn, kg: the nominal vehicle's."""
+    nominal = draw_vehicles(rocket, 1.0, np.zeros((1, len(draw_names(rocket)))))
+    last = len(rocket.burns) - 1
+    ends, flow, dropped = (getattr(nominal, name)[:last, 0] for name in ("end", "flow", "dropped"))
+    burnt = flow * np.diff(ends, prepend=0.0)
+    return (nominal.mass[0] - np.append(0.0, np.cumsum(burnt + dropped))).tolist()
