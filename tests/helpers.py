@@ -1,6 +1,15 @@
-"""What several test files ask of a task: its table, the title of its figures, a figure by its file's name."""
+"""What several test files use: a task's table, title and figures; a policy with random weights."""
+
+import json
+from dataclasses import asdict
+
+import gymnasium as gym
+import safetensors.torch
+import torch
 
 from common.tasks import task_of
+
+SMALL = {"embed_dim": 8, "num_heads": 2, "mlp_dim": 12, "hidden_dim": 10}
 
 
 def table_of(metrics):
@@ -16,3 +25,18 @@ def headline_of(metrics):
 def figure_of(name, arrays, metrics, curves=()):
     """One of an evaluation's figures."""
     return task_of(metrics["env_id"]).figures(arrays, metrics, list(curves))[name]
+
+
+def save(script, folder, **changes):
+    """A run folder's agent.safetensors with random weights: what starts as a constant is moved away from it."""
+    args = script.Args(**{**SMALL, "num_blocks": 1, "memory_length": 5, **changes})
+    options = {name: getattr(args, name) for name in script.ENV_OPTIONS} | script.FIXED_OPTIONS
+    torch.manual_seed(0)
+    agent = script.Agent(args, gym.make_vec(args.env_id, num_envs=1, **options))
+    with torch.no_grad():
+        for parameter in agent.parameters():
+            parameter += 0.3 * torch.randn_like(parameter)
+    counters = dict.fromkeys(["seed", "total_updates", "global_step", "training_seconds", "wall_seconds"], "1")
+    metadata = {"env_id": args.env_id, "args": json.dumps(asdict(args)), **counters}
+    safetensors.torch.save_file(agent.state_dict(), folder / "agent.safetensors", metadata)
+    return agent, args, options

@@ -3,14 +3,12 @@
 import copy
 import json
 import shutil
-from dataclasses import asdict
 from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import safetensors.torch
-import torch
 
 EXTRAS = "needs requirements-extras.txt"
 for package in ("onnx", "onnxscript", "onnxruntime"):
@@ -18,6 +16,7 @@ for package in ("onnx", "onnxscript", "onnxruntime"):
 
 from attention import load  # noqa: E402
 from decision import OnnxPolicy, compare  # noqa: E402
+from helpers import save  # noqa: E402
 
 import evaluate  # noqa: E402
 import ppo_gtrxl_di  # noqa: E402
@@ -31,7 +30,6 @@ from rocket.environment import fly_rocket  # noqa: E402
 
 ROOT = Path(__file__).parents[1]
 TOLERANCE = 1e-5
-SMALL = {"embed_dim": 8, "num_heads": 2, "mlp_dim": 12, "hidden_dim": 10}
 
 
 @pytest.fixture(scope="module")
@@ -100,21 +98,6 @@ def test_the_model_says_what_it_takes(cutoff):
 def write(script, checkpoint, path):
     """The model, made in this process."""
     path.write_bytes(onnx_model.export(script, checkpoint).model_proto.SerializeToString())
-
-
-def save(script, folder, **changes):
-    """A run folder's agent.safetensors with random weights: what starts as a constant is moved away from it."""
-    args = script.Args(**{**SMALL, "num_blocks": 1, "memory_length": 5, **changes})
-    options = {name: getattr(args, name) for name in script.ENV_OPTIONS} | script.FIXED_OPTIONS
-    torch.manual_seed(0)
-    agent = script.Agent(args, gym.make_vec(args.env_id, num_envs=1, **options))
-    with torch.no_grad():
-        for parameter in agent.parameters():
-            parameter += 0.3 * torch.randn_like(parameter)
-    counters = dict.fromkeys(["seed", "total_updates", "global_step", "training_seconds", "wall_seconds"], "1")
-    metadata = {"env_id": args.env_id, "args": json.dumps(asdict(args)), **counters}
-    safetensors.torch.save_file(agent.state_dict(), folder / "agent.safetensors", metadata)
-    return agent, args, options
 
 
 CASES = [

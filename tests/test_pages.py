@@ -17,8 +17,8 @@ import pytest
 pytest.importorskip("py_mini_racer", reason="needs mini-racer, of requirements-extras.txt")
 
 from attention import load  # noqa: E402
+from helpers import save  # noqa: E402
 from py_mini_racer import MiniRacer  # noqa: E402
-from test_onnx import save  # noqa: E402
 
 import evaluate  # noqa: E402
 import ppo_gtrxl_di  # noqa: E402
@@ -393,3 +393,16 @@ def test_every_rocket_has_a_page_s_constants():
         assert gym.spec(env_id)
         text = json.dumps([constants(mission, 1.0), sliders(mission.rocket)], allow_nan=False)
         assert len(json.loads(text)[0]["groups"]) >= 1
+
+
+@pytest.mark.slow
+def test_the_documents_examples():
+    """docs/take-with-you.md: a failure on the dispersed policy's page, and 1 % of thrust at the fixed time."""
+    page = (ROOT / "docs" / "take-with-you.md").read_text()
+    changes = {**NO_CHANGES, "failure": {"time": 400.0, "group": 3, "share": 0.1}}
+    flights = flights_of("rocket_dispersed", changes)
+    printed = re.search(r"policy ends with ‖error‖ (\S+), LQR with (\S+), open loop with (\S+)\. This", page).groups()
+    found = [f"{flights[name]['errorNorm']:.2g}" for name in ("policy", "lqr", "openLoop")]
+    assert list(printed) == found
+    fixed = flights_of("rocket_fixed", {**NO_CHANGES, "thrust": 0.01})
+    assert fixed["lqr"]["errorNorm"] > fixed["openLoop"]["errorNorm"]
