@@ -67,8 +67,7 @@ def publish(run_dir, folder, ship: bool = False, numbers: bool = False):
     """
     run_dir, folder = Path(run_dir), Path(folder)
     metrics, _ = read_evaluation(run_dir)
-    if metrics.get("checkpoint_sha256") != sha256_of(run_dir / "agent.safetensors"):
-        raise ValueError(f"{run_dir}/eval.json is not of its agent.safetensors (checkpoint_sha256 differs)")
+    refuse_another_policy(run_dir, metrics)
     curve = read_curve(run_dir)
     if not curve:
         raise ValueError(f"{run_dir} has no TensorBoard scalars")
@@ -94,6 +93,12 @@ def publish(run_dir, folder, ship: bool = False, numbers: bool = False):
             animate(staged)
             keep_excerpt(staged / "eval.npz", task_of(metrics["env_id"]))
         move(staged, folder, last, replaced=of_another_policy(folder) if ships else ())
+
+
+def refuse_another_policy(folder: Path, metrics: dict):
+    """ValueError where a folder's evaluation is not of its policy."""
+    if metrics.get("checkpoint_sha256") != sha256_of(folder / "agent.safetensors"):
+        raise ValueError(f"{folder}/eval.json is not of its agent.safetensors (checkpoint_sha256 differs)")
 
 
 def shorten(run_dir) -> Path:
@@ -239,12 +244,13 @@ def export(folder, targets: dict[str, Path], epoch: datetime = EPOCH, launch_lon
 def page(folder, target=None, launch_longitude: float = LAUNCH_LONGITUDE) -> Path:
     """Write the page of a results or run folder, in which its policy flies in a browser; returns its path.
 
-    `target` is page.html in the folder where it is not given; the longitude (degrees east) is a rocket's. BadInput
-    where there is no page of such an environment or policy.
+    `target` is page.html in the folder where it is not given; the longitude (degrees east) is a rocket's. OSError or
+    ValueError where a file is missing or bad, or there is no page of such an environment or policy.
     """
     folder = Path(folder)
     target = Path(target or folder / "page.html")
     metrics, arrays = read_evaluation(folder)
+    refuse_another_policy(folder, metrics)
     checkpoint = read_checkpoint(folder / "agent.safetensors", {"num_heads": int, "memory_length": int}, flag="")
     found = task_of(metrics["env_id"]).page(metrics, arrays, checkpoint, launch_longitude)
     write_bytes(target, html_bytes(found))

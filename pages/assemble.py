@@ -75,7 +75,7 @@ def network(checkpoint: dict, inputs: int) -> dict:
     BadInput where the policy was trained on other features.
     """
     tensors, args = checkpoint["tensors"], checkpoint["args"]
-    wide = tensors["encoder.0.weight"].shape[1]
+    wide = tensors["encoder.0.weight"].shape[1] if "encoder.0.weight" in tensors else 0
     refuse_unless(wide == inputs, "the policy's number of features", wide, f"must be {inputs} to fly in a page")
     return {
         "heads": args["num_heads"],

@@ -142,9 +142,9 @@ class Scene {
     };
     const { focus, from } = places[view];
     this.focus.set(...focus);
-    this.radius = norm(from);
+    this.radius = norm(from) * Math.max(1, 1.2 / this.camera.aspect); // further away where the picture is narrow
     this.azimuth = Math.atan2(from[1], from[0]);
-    this.elevation = Math.asin(from[2] / this.radius);
+    this.elevation = Math.asin(from[2] / norm(from));
     this.render();
   }
 

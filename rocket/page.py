@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 
+from common.errors import refuse_unless
 from pages.assemble import Page, network
 from rocket.dispersion import (
     DISPERSION,
@@ -36,6 +37,8 @@ def page(env_id: str, mission: Mission, metrics: dict, arrays: dict, checkpoint:
     BadInput where no vehicle can be drawn of the table, or the policy has other features.
     """
     rocket = mission.rocket
+    allowed = "must be False for a page: its stages keep what a vehicle of the page would drop"
+    refuse_unless(not rocket.table_isp, f"table_isp of {env_id}", rocket.table_isp, allowed)
     check_drawable(rocket)
     options = {name: checkpoint["args"].get(name, default) for name, default in OPTIONS.items()}
     scores = len(draw_names(rocket)) if options["observe_draw"] else 0

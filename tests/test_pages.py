@@ -4,6 +4,7 @@ import copy
 import json
 import math
 import re
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -34,6 +35,7 @@ from phased.problem import PROBLEMS  # noqa: E402
 from rocket import guidance  # noqa: E402
 from rocket.dispersion import DISPERSION, draw_sigmas  # noqa: E402
 from rocket.page import constants, sliders  # noqa: E402
+from rocket.page import page as rocket_page  # noqa: E402
 from rocket.vehicle import BOOSTER, STAGE_1, STAGE_2  # noqa: E402
 
 ROOT = Path(__file__).parents[1]
@@ -376,9 +378,19 @@ def test_a_policy_with_other_features_is_one_line(tmp_path):
         task_of("DoubleIntegrator-v0").page({}, {"x": np.zeros((1, 2, 2))}, checkpoint, 0.0)
 
 
+def test_a_rocket_by_the_tables_isp_is_one_line():
+    mission = replace(ROCKETS["RocketAscentCutoff-v0"], rocket=replace(ROCKET, table_isp=True))
+    with pytest.raises(BadInput, match="^table_isp of Mine-v0 is True; it must be False for a page"):
+        rocket_page("Mine-v0", mission, {}, {}, {}, 0.0)
+
+
 def test_a_page_that_fails_leaves_the_old_one(tmp_path):
+    """Of a folder whose policy is another's."""
+    for name in ("eval.json", "eval.npz"):
+        shutil.copy(ROOT / "results" / "di" / name, tmp_path)
+    shutil.copy(ROOT / "results" / "vdp" / "agent.safetensors", tmp_path)
     (tmp_path / "page.html").write_text("as before")
-    with pytest.raises((OSError, ValueError)):
+    with pytest.raises(ValueError, match="eval.json is not of its agent.safetensors"):
         evaluate.page(tmp_path)
     assert (tmp_path / "page.html").read_text() == "as before"
 
