@@ -17,9 +17,10 @@ import pytest
 
 pytest.importorskip("py_mini_racer", reason="needs mini-racer, of requirements-extras.txt")
 
+import page_flights  # noqa: E402
 from attention import load  # noqa: E402
 from helpers import save  # noqa: E402
-from py_mini_racer import MiniRacer  # noqa: E402
+from page_flights import CHANGED, NO_CHANGES, Engine  # noqa: E402
 
 import evaluate  # noqa: E402
 import ppo_gtrxl_di  # noqa: E402
@@ -42,31 +43,12 @@ ROOT = Path(__file__).parents[1]
 ROCKET_RESULTS = ("rocket_dispersed", "rocket_cutoff", "rocket_fixed", "two_stage_leo")
 PLANE_RESULTS = ("di", "vdp", "di_waypoints", "vdp_waypoints")
 CHANGES = {"thrust": 0.01, "drag": 0.1, "windEast": 15.0, "windNorth": -10.0, "payload": 30.0, "failure": None}
-NO_CHANGES = {**dict.fromkeys(CHANGES, 0.0), "failure": None}
-
-
-class Engine:
-    """The scripts of a page, without those that draw, in V8."""
-
-    def __init__(self, html: str):
-        self.v8 = MiniRacer()
-        scripts = re.findall(r'<script data-file="([\w./]+)">\n(.*?)</script>', html, flags=re.DOTALL)
-        for name, code in scripts:
-            if name in ("numbers.js", "policy.js") or name.startswith(("rocket_", "plane_")):
-                self.v8.eval(code)
-        (data,) = re.findall(r'<script type="application/json" id="data">(.*?)</script>', html, flags=re.DOTALL)
-        self.v8.eval(f"const data = decoded({data})")
-
-    def __call__(self, expression: str):
-        return json.loads(self.v8.eval(f"JSON.stringify({expression})"))
 
 
 @cache
 def page_of(result: str) -> str:
     """The page of a result."""
-    metrics, arrays = read_evaluation(ROOT / "results" / result)
-    checkpoint = read_checkpoint(ROOT / "results" / result / "agent.safetensors", {})
-    return assemble.html_bytes(task_of(metrics["env_id"]).page(metrics, arrays, checkpoint, -80.6)).decode()
+    return page_flights.page_of(ROOT / "results" / result)
 
 
 @cache
@@ -409,12 +391,12 @@ def test_every_rocket_has_a_page_s_constants():
 
 @pytest.mark.slow
 def test_the_documents_examples():
-    """docs/take-with-you.md: a failure on the dispersed policy's page, and 1 % of thrust at the fixed time."""
-    page = (ROOT / "docs" / "take-with-you.md").read_text()
-    changes = {**NO_CHANGES, "failure": {"time": 400.0, "group": 3, "share": 0.1}}
-    flights = flights_of("rocket_dispersed", changes)
-    printed = re.search(r"policy ends with ‖error‖ (\S+), LQR with (\S+), open loop with (\S+)\. This", page).groups()
-    found = [f"{flights[name]['errorNorm']:.2g}" for name in ("policy", "lqr", "openLoop")]
-    assert list(printed) == found
+    """docs/take-with-you.md: the dispersed policy's page with other vehicles, and 1 % of thrust at the fixed time."""
+    text = (ROOT / "docs" / "take-with-you.md").read_text()
+    (table,) = re.findall(r"\| changed \|.*\n\|[-|]+\|\n((?:\|.*\n)+)", text)
+    rows = [[cell.strip() for cell in line.split("|")[2:-1]] for line in table.splitlines()]
+    for change, row in zip(CHANGED, rows, strict=True):
+        flights = flights_of("rocket_dispersed", {**NO_CHANGES, **change})
+        assert row == [f"{flights[name]['errorNorm']:.2g}" for name in ("policy", "lqr", "openLoop")], change
     fixed = flights_of("rocket_fixed", {**NO_CHANGES, "thrust": 0.01})
     assert fixed["lqr"]["errorNorm"] > fixed["openLoop"]["errorNorm"]
