@@ -122,7 +122,7 @@ OURS = {
     "mlp_dim": 64,
     "hidden_dim": 64,
     "total_updates": 280,
-    "num_envs": 1024,  # with fewer flights an update the noise of the touchdown hides what propellant costs
+    "num_envs": 1024,  # with fewer an update flights burn more
     "num_minibatches": 32,
     "flights_per_start": 32,
     "update_epochs": 4,
@@ -136,7 +136,7 @@ OURS = {
     "memory_noise": "0:0.01 1:0",
     "log_std": "0:-1 0.6:-2.5 1:-3.6",  # a policy that learned with less noise has less reserve
     "fuel_weight": 4.0,
-    "slope_weight": "0:0 0.5:0 0.7:2",  # late: with much noise a steep descent has to be a slow one
+    "slope_weight": "0:0 0.5:0 0.7:2",  # late: while noise is large, few descents are steep
     "weight_average": 0.998,
     "decision_s": 0.4,
     "action_hold": "0:2.5 0.6:2.5 0.8:1",  # noise that is held explores farther, and steps of 1 s are cheap

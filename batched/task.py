@@ -123,12 +123,6 @@ class BatchedTask(SampledTask):
     def flight_columns(self, arrays: dict, metrics: dict) -> dict:
         return export.flight_columns(arrays)
 
-    def track(self, arrays: dict):
-        raise BadInput(f"the env_id is {self.env_id}; for OEM and CZML it must be a rocket's")
-
-    def page(self, metrics: dict, arrays: dict, checkpoint: dict, launch_longitude: float):
-        raise BadInput(f"the env_id is {self.env_id}; a page is of a rocket or of a small problem")
-
     # --- commands
 
     def speed_cases(self) -> list[tuple[str, dict, list | None]]:

@@ -166,7 +166,19 @@ class Task(Protocol):
         ...
 
 
-class SampledTask:
+class GroundTask:
+    """What is refused of an id whose flights do not go around the Earth."""
+
+    env_id: str
+
+    def track(self, arrays: dict) -> Any:
+        raise BadInput(f"the env_id is {self.env_id}; for OEM and CZML it must be a rocket's")
+
+    def page(self, metrics: dict, arrays: dict, checkpoint: dict, launch_longitude: float) -> Any:
+        raise BadInput(f"the env_id is {self.env_id}; a page is of a rocket or of a small problem")
+
+
+class SampledTask(GroundTask):
     """What tasks have in common whose flights are sampled anew by every seed, and all cost the same."""
 
     def reported_metrics(self, metrics: dict, timed_policy: Callable | None = None, **env_options) -> dict:

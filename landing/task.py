@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.command_line import integer
-from common.errors import BadInput
-from common.tasks import Interface
+from common.tasks import GroundTask, Interface
 from landing import export
 from landing.comparison import compare
 from landing.environment import fly_lander
@@ -23,7 +22,7 @@ BRIEF_FLIGHTS = 10  # of the reported evaluation of a training cut short
 
 
 @dataclass(frozen=True)
-class LanderTask:
+class LanderTask(GroundTask):
     """A lander in `LANDERS`: every flight has its own draw."""
 
     env_id: str
@@ -139,12 +138,6 @@ class LanderTask:
 
     def flight_columns(self, arrays: dict, metrics: dict) -> dict:
         return export.flight_columns(arrays)
-
-    def track(self, arrays: dict):
-        raise BadInput(f"the env_id is {self.env_id}; for OEM and CZML it must be a rocket's")
-
-    def page(self, metrics: dict, arrays: dict, checkpoint: dict, launch_longitude: float):
-        raise BadInput(f"the env_id is {self.env_id}; a page is of a rocket or of a small problem")
 
     # --- commands
 

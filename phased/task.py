@@ -147,9 +147,6 @@ class PhasedTask(SampledTask):
     def flight_columns(self, arrays: dict, metrics: dict) -> dict:
         return export.flight_columns(self.problem, arrays)
 
-    def track(self, arrays: dict):
-        raise BadInput(f"the env_id is {self.env_id}; for OEM and CZML it must be a rocket's")
-
     def page(self, metrics: dict, arrays: dict, checkpoint: dict, launch_longitude: float) -> Page:
         return problem_page(self.problem, arrays, checkpoint)
 
