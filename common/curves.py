@@ -30,9 +30,13 @@ def write_csv(path, curve: dict):
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["global_step", *columns])
         for step in sorted(set().union(*columns.values())):
-            # TensorBoard keeps float32, which nine digits give back exactly
-            cells = (f"{column[step]:.9g}" if step in column else "" for column in columns.values())
+            cells = (cell(column[step]) if step in column else "" for column in columns.values())
             writer.writerow([step, *cells])
+
+
+def cell(value: float) -> str:
+    """A number as text: a whole one exactly, another by six digits, which draw the same curve."""
+    return f"{value:.0f}" if value == round(value) else f"{value:.6g}"
 
 
 def evaluated(curve: dict) -> dict:

@@ -59,7 +59,7 @@ def test_table_1_s_rocket_is_the_last_evaluation_of_its_curve():
     folder = RESULTS / "table_1" / "rocket"
     metrics, curve = json.loads((folder / "seeds/1.json").read_text()), curves.read_csv(folder / "seeds/1.csv")
     for key in set(metrics) - {"env_id", "device", "torch_version"}:  # a curve holds no words
-        assert curve[f"eval/{key}"][1][-1] == pytest.approx(float(metrics[key]), rel=1e-7), key
+        assert curve[f"eval/{key}"][1][-1] == pytest.approx(float(metrics[key]), rel=5e-6), key
     sampled = dict(re.findall(r"update (\d+)/.* sampled error (\S+)  mean", (folder / "training.log").read_text()))
     updates, seconds, misses, perigees = (
         curve[f"eval/{key}"][1] for key in ("total_updates", "training_seconds", "error_norm", "perigee_km")
