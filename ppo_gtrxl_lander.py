@@ -109,6 +109,8 @@ class Args:
     slope_weight: Schedule = 2.0  # weight of a flat last descent in training (`slope_reward` of landing/rewards.py)
     training_failure_size: float = 2.0  # --failure-size in training, as published
     thrust_share: float = 1.0  # share of the greatest thrust that training may ask for
+    start_spread: float = 1.0  # factor on the width of the starts in training, along x and y
+    wind: Schedule = 0.0  # amplitude (m/s^2) of a sideways acceleration in training that comes and goes
     action_hold: Schedule = 1.0  # training holds an action so many times as long as --decision-s
     weight_average: float = 0.0  # decay, per optimiser step, of the averaged weights used in evaluation
 
@@ -135,7 +137,7 @@ OURS = {
     "target_kl": 0.03,
     "memory_noise": "0:0.01 1:0",
     "log_std": "0:-1 0.6:-2.5 1:-3.6",  # a policy that learned with less noise has less reserve
-    "fuel_weight": 4.0,
+    "fuel_weight": "0:4 0.2:4 0.4:8",
     "slope_weight": "0:0 0.5:0 0.7:2",  # late: while noise is large, few descents are steep
     "weight_average": 0.998,
     "decision_s": 0.4,
@@ -144,6 +146,8 @@ OURS = {
 MARS = {
     **OURS,
     "thrust_share": 0.8,  # the rest is a reserve for failures that are worse than those of the training
+    "start_spread": 1.25,  # so is this: less thrust sideways is as if the pad were farther
+    "wind": "0:0.7 0.8:0.7 1:0.2",  # and this: a policy has to see its motion answer less than it expects
     "longest_flight": 60.0,  # flights of learned policies take 45 s
 }
 ONE_START = {  # all flights of an update are compared
@@ -215,7 +219,7 @@ def describe(episodes, metrics):
 
 # Problem, ours: what only training changes ----------------------------------------------------------------------------
 ALOFT_PRICE = 20.0  # hovering above the pad must cost more than any miss
-SINK_RATE = 0.5  # m/s; a policy that aims at rest on the ground can come to rest just above it, and hover
+SINK_RATE = 0.8  # m/s; a policy that aims at rest on the ground can come to rest just above it, and hover
 
 
 def set_curriculum(envs, args, progress):
@@ -234,6 +238,8 @@ def set_curriculum(envs, args, progress):
     envs.sink_rate = SINK_RATE
     envs.failure_size = args.training_failure_size
     envs.thrust_share = args.thrust_share
+    envs.start_spread = args.start_spread
+    envs.wind = value_at(args.wind, progress)
     hold = value_at(args.action_hold, progress) * args.decision_s / PERIOD
     envs.decision_s = max(round(hold), 1) * PERIOD
     group = round(value_at(args.flights_per_start, progress))

@@ -51,8 +51,8 @@ class LanderVectorEnv(BatchedEnv):
 
     Reward: -`fuel_price` for 100 kg burnt in the step; at the end `terminal_reward`, and `slope_reward` or, in the air,
     -`aloft_price`. The prices and scales are attributes that only training changes. So are `sink_rate` (m/s), the
-    vertical speed at touchdown that counts as none, and `thrust_share`, the share of the greatest thrust that a command
-    may ask for.
+    vertical speed at touchdown that counts as none; `thrust_share`, the share of the greatest thrust that a command may
+    ask for; `start_spread`, a factor on the width of the starts along x and y; and `wind`, the amplitude of `sway`.
 
     `final_info`: `episodic_return` (with the prices and scales of `rewards.py`), `position_error` (m), `speed` (m/s),
     `slope`, `down`, `landed`, `fuel_kg`, `final_time` (s), each (N,), `final_y` (N, 7) and `draw` (N, 13).
@@ -100,7 +100,7 @@ class LanderVectorEnv(BatchedEnv):
             self.observation_scale = np.append(self.observation_scale, np.ones(7))
         self.position_scale, self.speed_scale, self.sink_rate = POSITION_SCALE, SPEED_SCALE, 0.0
         self.fuel_price, self.aloft_price, self.slope_price = FUEL_PRICE, ALOFT_PRICE, SLOPE_PRICE
-        self.thrust_share = 1.0
+        self.thrust_share, self.start_spread, self.wind = 1.0, 1.0, 0.0
         self.draw = np.zeros((num_envs, len(DRAW)))
         self.flights = self._drawn(self.draw)
         self.r, self.v, self.mass = self.flights.r.copy(), self.flights.v.copy(), self.flights.mass.copy()
@@ -130,7 +130,8 @@ class LanderVectorEnv(BatchedEnv):
         self.episode_steps = math.ceil(self.longest_flight / self.dt - 1e-9) + self.published_end
 
     def _drawn(self, draw) -> Flights:
-        return flights(self.lander, draw, self.failure_probability, self.failure_size, self.failure_time)
+        failure = self.failure_probability, self.failure_size, self.failure_time
+        return flights(self.lander, draw, *failure, self.start_spread)
 
     def _observation_space(self):
         """The box that holds every observation."""
@@ -181,6 +182,16 @@ class LanderVectorEnv(BatchedEnv):
         has_struck = self._ticks * PERIOD >= self.flights.strike
         return np.where(has_struck, self.flights.failed, 1.0)
 
+    def sway(self) -> np.ndarray:
+        """The acceleration (3, N) of `wind`: a sine along x and one along y, with a period of 10 to 30 s.
+
+        Period and phases are digits of the draw that nothing else depends on: flights of one draw have one wind.
+        """
+        digits = self.draw * 1000 % 1
+        turns = self.time / (10 + 20 * digits[:, 2])
+        along_x, along_y = (np.sin(2 * np.pi * (turns + digits[:, axis])) for axis in (0, 1))
+        return self.wind * np.stack([along_x, along_y, np.zeros(self.num_envs)])
+
     def _observe(self):
         obs = np.empty((self.num_envs, self.single_observation_space.shape[0]))
         obs[:, 0:3] = self.r.T
@@ -214,7 +225,8 @@ class LanderVectorEnv(BatchedEnv):
         lander = self.lander
         thrust = limited(command * self.effectiveness(), lander.least_thrust, lander.greatest_thrust)
         norm = np.sqrt((thrust * thrust).sum(axis=0))
-        arc = Arc(self.r, self.v, self.mass, thrust / norm, norm / lander.exhaust, self.flights.gravity)
+        gravity = self.flights.gravity + self.sway() if self.wind else self.flights.gravity
+        arc = Arc(self.r, self.v, self.mass, thrust / norm, norm / lander.exhaust, gravity)
         length = PERIOD
         r, v, mass = arc.after(PERIOD, lander)
         if self.published_end:
@@ -327,6 +339,8 @@ class LanderEnv(SingleEnv):
     aloft_price = of_batch("aloft_price", "Reward lost where a flight ends in the air.")
     slope_price = of_batch("slope_price", "Weight of `slope_reward`.")
     thrust_share = of_batch("thrust_share", "Share of the greatest thrust that a command may ask for.")
+    start_spread = of_batch("start_spread", "Factor on the width of the starts, along x and y.")
+    wind = of_batch("wind", "Amplitude (m/s^2) of an acceleration along x and y that comes and goes.")
 
 
 def make_lander_vector(env_id: str, num_envs: int = 1, **options) -> LanderVectorEnv:

@@ -111,15 +111,18 @@ class Flights(NamedTuple):
 DRAW = ("x", "y", "z", "vx", "vy", "vz", "mass", "gx", "gy", "gz", "failure", "axis", "moment")
 
 
-def flights(lander: Lander, draw: np.ndarray, probability: float, size: float, time: str) -> Flights:
-    """The flights of draws (n, 13).
+def flights(
+    lander: Lander, draw: np.ndarray, probability: float, size: float, time: str, start_spread: float = 1.0
+) -> Flights:
+    """The flights of draws (n, 13). `start_spread` widens the box of the starts, but not its heights and sink rates.
 
     A failure is there where the draw's "failure" is below `probability`. It divides the thrust along x ("axis" below
     0.5) or y by `size`, and along z by 1.5.
     """
     start, spread = np.array(lander.start), np.array(lander.spread)
     centred = 2 * draw - 1
-    state = start + spread * centred[:, :6]
+    widths = np.array([start_spread, start_spread, 1.0] * 2)
+    state = start + widths * spread * centred[:, :6]
     gravity = lander.gravity * lander.gravity_spread * centred[:, 7:10]
     gravity[:, 2] -= lander.gravity
     has_failed = draw[:, 10] < probability

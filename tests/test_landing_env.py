@@ -242,6 +242,36 @@ def test_a_share_of_the_thrust_limits_commands():
         assert np.array_equal(obs, free_ones.advance(up(free_ones, flown))[0])
 
 
+def test_training_may_widen_the_starts_along_x_and_y():
+    draw = np.random.default_rng(9).random((4, len(DRAW)))
+    wide, drawn = gym.make_vec(ID, num_envs=4), gym.make_vec(ID, num_envs=4)
+    wide.unwrapped.start_spread = 1.5
+    wide_obs, obs = (batch.reset(options={"draw": draw})[0] for batch in (wide, drawn))
+    assert wide_obs[:, 0] - 1000 == pytest.approx(1.5 * (obs[:, 0] - 1000))
+    assert wide_obs[:, 1] == pytest.approx(1.5 * obs[:, 1])
+    assert wide_obs[:, 3] + 40 == pytest.approx(1.5 * (obs[:, 3] + 40))
+    assert wide_obs[:, 4] == pytest.approx(1.5 * obs[:, 4])
+    assert np.array_equal(wide_obs[:, [2, 5]], obs[:, [2, 5]])
+
+
+def test_a_wind_sways_the_lander_to_and_fro():
+    """Its velocity from the same commands differs by the integral of the sine, which is flown in periods of 0.2 s."""
+    draw = np.random.default_rng(9).random((4, len(DRAW)))
+    windy, calm = gym.make_vec(ID, num_envs=4), gym.make_vec(ID, num_envs=4)
+    windy.unwrapped.wind = 0.5
+    for batch in (windy, calm):
+        batch.reset(options={"draw": draw})
+    digits = draw * 1000 % 1
+    turning = 2 * np.pi / (10 + 20 * digits[:, 2])  # rad/s
+    for step in range(1, 101):
+        blown, straight = windy.advance(up(windy, 9000.0))[0], calm.advance(up(calm, 9000.0))[0]
+        for axis in (0, 1):
+            phase = 2 * np.pi * digits[:, axis]
+            gained = 0.5 / turning * (np.cos(phase) - np.cos(turning * 0.2 * step + phase))
+            assert blown[:, 3 + axis] - straight[:, 3 + axis] == pytest.approx(gained, abs=0.11)
+        assert blown[:, 5] == pytest.approx(straight[:, 5])
+
+
 def test_what_is_hidden_and_what_an_oracle_sees():
     draw = np.random.default_rng(2).random((5, len(DRAW)))
     draw[:, 10] = 0.1

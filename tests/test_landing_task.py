@@ -12,7 +12,7 @@ import evaluate
 from common.evaluations import read_evaluation
 from common.tasks import task_of
 from landing.environment import fly_lander
-from landing.metrics import draws, flight_metrics, fly_draws
+from landing.metrics import KEPT_FLIGHTS, draws, flight_metrics, fly_draws
 from landing.task import held
 
 ID = "MarsLanding-v0"
@@ -54,7 +54,7 @@ def test_batches_do_not_change_a_flight():
     whole = fly_lander(ID, falls, z)
     assert np.array_equal(parts["final_y"], whole["final_y"])
     assert np.array_equal(parts["u"], whole["u"], equal_nan=True)
-    assert parts["y"].shape[0] == 100
+    assert parts["y"].shape[0] == KEPT_FLIGHTS
 
 
 def test_recorded_flights_can_be_flown_again():
