@@ -579,21 +579,24 @@ def fly_rocket(env_id: str, policy: Callable, end_time: float | None = None, dra
 
     draw (k,): the vehicle's standard scores and its failure, with the options `dispersion` and `failure`.
 
-    Returns t (K+1,) s, u (K, 3) the unit directions in ECI, y (K+1, 7) r, v, m, reward (K,), and the last step's info.
+    Returns t (K+1,) s, u (K, 3) the unit directions in ECI, y (K+1, 7) r, v, m, reward (K,), `parts` (K, 5), the sums
+    so far of the reward's `PARTS`, and the last step's info.
     """
     env: Any = gym.make_vec(env_id, num_envs=1, **options)  # a RocketVectorEnv
     if end_time is not None:
         env.end_time = end_time
     obs, _ = env.reset(options=None if draw is None else {"draw": [draw]})
-    t, u, y, rewards, final = [0.0], [], [env.y[:, 0].copy()], [], {}
+    t, u, y, rewards, parts, final = [0.0], [], [env.y[:, 0].copy()], [], [], {}
     while not final:
         obs, reward, _, final = env.advance(policy(obs, len(u)))
         t.append(env.time[0])
         u.append(env.u[:, 0])
         y.append(env.y[:, 0].copy())
         rewards.append(reward[0])
+        parts.append(env._parts[:, 0].copy())
     final = {key: value[0] for key, value in final.items()}
-    return {"t": np.array(t), "u": np.array(u), "y": np.array(y), "reward": np.array(rewards), **final}
+    flight = {"t": np.array(t), "u": np.array(u), "y": np.array(y), "reward": np.array(rewards)}
+    return {**flight, "parts": np.array(parts), **final}
 
 
 make_rocket.metadata = RENDERED  # where gym.make looks before there is an environment
