@@ -22,7 +22,7 @@ from phased.problem import flights_of_seed
 
 ROOT = Path(__file__).resolve().parents[1]
 OWN_PROBLEM = ROOT / "docs" / "own-problem.md"
-PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / name for name in ("README.md", "CHANGELOG.md", "CONTRIBUTING.md")] + sorted((ROOT / "docs").rglob("*.md"))
 PAGES += sorted((ROOT / "results").rglob("README.md"))  # they hold the commands of all results
 each_page = pytest.mark.parametrize("page", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
 ROCKETS = ("rocket_fixed", "rocket_cutoff", "rocket_dispersed", "two_stage_leo")
