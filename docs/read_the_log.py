@@ -22,7 +22,7 @@ import envs  # noqa: E402
 import ppo_gtrxl_rocket as script  # noqa: E402
 import runs  # noqa: E402
 from common.curves import read_csv  # noqa: E402
-from drawing.style import BOUNDARY, OPTIMUM, POLICY, save_figures  # noqa: E402
+from drawing.style import BOUNDARY, OPTIMUM, save_figures  # noqa: E402
 from drawing.training import plot_seeds  # noqa: E402
 from rocket.environment import RocketVectorEnv  # noqa: E402
 
@@ -132,7 +132,7 @@ def show_miss(ax, curves, tag, subtract):
     plot_seeds(ax, [(steps, values - subtract) for steps, values in (curve[tag] for curve in curves)], "mean")
 
 
-# ------------------------------------------------------------------------------- the parts of the reward over one flight
+# ------------------------------------------------------------------------------ the parts of the reward over one flight
 ENV_ID = "RocketAscentCutoff-v0"
 PART_COLORS = ("tab:red", "tab:green", "tab:blue", "tab:orange", "black")
 

@@ -22,7 +22,8 @@ from phased.problem import flights_of_seed
 
 ROOT = Path(__file__).resolve().parents[1]
 OWN_PROBLEM = ROOT / "docs" / "own-problem.md"
-PAGES = [ROOT / name for name in ("README.md", "CHANGELOG.md", "CONTRIBUTING.md")] + sorted((ROOT / "docs").rglob("*.md"))
+PAGES = [ROOT / f"{name}.md" for name in ("README", "CHANGELOG", "CONTRIBUTING", "problems/README", "pages/README")]
+PAGES += sorted((ROOT / "docs").rglob("*.md"))
 PAGES += sorted((ROOT / "results").rglob("README.md"))  # they hold the commands of all results
 each_page = pytest.mark.parametrize("page", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
 ROCKETS = ("rocket_fixed", "rocket_cutoff", "rocket_dispersed", "two_stage_leo")
@@ -289,3 +290,37 @@ def test_noise_wastes_the_speed_that_the_page_says(monkeypatch, capsys):
     assert calm[2] < 0.0002 and memory[2] < 0.001 and max(abs(calm[3]), abs(memory[3])) < 0.002
     for *_, miss, too_fast in (action, both):
         assert miss == pytest.approx(0.18, abs=0.015) and too_fast == pytest.approx(-0.5, abs=0.06)
+
+
+def glossary():
+    """The terms of docs/glossary.md by section."""
+    sections = re.split(r"^## ", text_of(ROOT / "docs" / "glossary.md"), flags=re.MULTILINE)[1:]
+    tables = {
+        section.splitlines()[0]: [line for line in section.splitlines() if line[:1] == "|"] for section in sections
+    }
+    rows = {name: [cells(line) for line in lines[2:]] for name, lines in tables.items()}
+    assert len(rows) == 5 and all(rows.values())
+    return rows
+
+
+def test_the_glossary_is_in_order_and_each_term_has_one_sentence_and_a_link():
+    plain = lambda term: re.sub(r"[^\w ]", "", term).lower()  # noqa: E731
+    terms = [term for rows in glossary().values() for term, *_ in rows]
+    assert len(terms) == len(set(terms)) > 70
+    for rows in glossary().values():
+        assert [term for term, *_ in rows] == sorted((term for term, *_ in rows), key=plain)
+        for term, meaning, where in rows:
+            assert meaning and ". " not in meaning and re.fullmatch(r"\[[^]]+\]\([^)]+\)", where), term
+
+
+def test_the_terms_of_the_glossary_are_used():
+    """On the front page or another one; a plural counts."""
+    used = "\n".join(text_of(page) for page in PAGES if page.name not in ("glossary.md", "CHANGELOG.md")).lower()
+    idle = [
+        term
+        for rows in glossary().values()
+        for terms, *_ in rows
+        for term in terms.split(", ")
+        if not re.search(rf"(?<!\w){re.escape(term.lower())}", used)
+    ]
+    assert idle == []
