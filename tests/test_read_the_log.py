@@ -25,7 +25,6 @@ import read_the_log  # noqa: E402
 
 PAGE = read_the_log.PAGE.read_text()
 DI = importlib.import_module("ppo_gtrxl_di")
-ROWS = [line for line in PAGE.splitlines() if line.startswith("| `")]
 TAG = re.compile(r"`((?:charts|losses|eval)/[^`]+)`")
 
 
@@ -88,6 +87,7 @@ def written(smoke):
     return tags | numbers_of(evaluate.evaluate(cutoff, open_loop, 0, 100, dispersion=1.0, failure=0.3)[0])
 
 
+@pytest.mark.slow
 def test_every_tag_of_a_run_is_on_the_page(written):
     patterns = {tag: pattern_of(tag) for tag in tags_of_the_page()}
     assert {"charts/SPS", "losses/approx_kl", "eval/ratio_of_sums", "eval/failure_saved_rate"} <= written
@@ -95,6 +95,7 @@ def test_every_tag_of_a_run_is_on_the_page(written):
     assert wrong == {}
 
 
+@pytest.mark.slow
 def test_every_tag_of_the_page_is_written_by_a_run(written):
     tags = tags_of_the_page()
     assert len(tags) == len(set(tags)) > 80
@@ -152,6 +153,7 @@ def test_every_script_has_a_line():
     assert [name for name, _ in LINES] == list(FLIGHTS) and set(FLIGHTS) == scripts
 
 
+@pytest.mark.slow
 def test_a_smoke_run_prints_such_lines(smoke):
     printed = [line for line in smoke[0].splitlines() if line.startswith("update ")]
     assert len(printed) == 2
@@ -191,6 +193,7 @@ def flights():
     return read_the_log.fly_shipped(), read_the_log.fly_straight_up()
 
 
+@pytest.mark.slow
 def test_the_parts_add_up_to_what_was_paid(flights):
     """At every step; and at the end they are those of the shipped evaluation."""
     for flight in flights:
@@ -201,6 +204,7 @@ def test_the_parts_add_up_to_what_was_paid(flights):
         assert value == pytest.approx(metrics[part], abs=1e-3), part
 
 
+@pytest.mark.slow
 def test_pictures_are_drawn_and_small(flights, tmp_path, monkeypatch):
     monkeypatch.setattr(read_the_log, "fly_shipped", lambda: flights[0])
     monkeypatch.setattr(read_the_log, "fly_straight_up", lambda: flights[1])
