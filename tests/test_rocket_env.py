@@ -248,7 +248,9 @@ def test_fly_rocket_records_the_flight(env_id, end_time):
     np.testing.assert_array_equal(flight["y"], seen[:, :7])
     np.testing.assert_array_equal(flight["reward"], rewards)
     np.testing.assert_array_equal(flight["t"][:-1], v.grid[: len(rewards)])
-    assert flight["t"][-1] == final["final_time_s"] and set(flight) == KEYS | {"t", "u", "y", "reward"}
+    assert flight["t"][-1] == final["final_time_s"] and set(flight) == KEYS | {"t", "u", "y", "reward", "parts"}
+    np.testing.assert_array_equal(flight["parts"][-1], [final[part] for part in RocketVectorEnv.PARTS])
+    np.testing.assert_allclose(np.diff(flight["parts"].sum(axis=1)), rewards[1:], rtol=0, atol=1e-9)
     assert end_time is None or final["final_time_s"] == end_time
     expected = [v.programme(2 * t) @ v.up_along_cross(s) for t, s in enumerate(seen[:-1])]
     np.testing.assert_allclose(flight["u"], expected, rtol=0, atol=1e-14)
