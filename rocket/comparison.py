@@ -24,6 +24,7 @@ from common.policies import evaluate_by_script
 from rocket import guidance
 from rocket.dispersion import draw_vehicles
 from rocket.failure import check_failure
+from rocket.losses import loss_lines, loss_report
 from rocket.metrics import (
     AT_ONCE,
     SUCCESS,
@@ -52,6 +53,7 @@ KNOWLEDGE = {  # what each opponent has to know
     "optimum": "the draw itself",
 }
 REPLANS = ("replan", "replan_measured", "replan_hint")
+SOLVING = (*REPLANS, "optimum")  # fly the first flights alone
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -135,12 +137,16 @@ class Comparison:
         return draws(self.rocket, self.dispersion, self.eval_seed, n, self.failing.failure)
 
     def fly(self, name: str, opponent, n: int):
-        """Fly an opponent on the first n draws; what solves tells the time of its decisions itself."""
+        """Fly an opponent on the first n draws; what solves tells the time of its decisions itself.
+
+        What was made for the first `solved` flights flies them in one batch.
+        """
+        at_once = n if name in SOLVING else AT_ONCE
         _, self.arrays[name] = evaluate_dispersed(
-            self.env_id, opponent, self.eval_seed, n, self.dispersion, **self.failures
+            self.env_id, opponent, self.eval_seed, n, self.dispersion, at_once, **self.failures
         )
         self.about[name] = {"knows": KNOWLEDGE[name]}
-        if name not in (*REPLANS, "optimum"):
+        if name not in SOLVING:
             self.about[name]["decision_us"] = decision_us(self.env_id, opponent)
 
     def replan(self, name: str, exhaust):
@@ -188,21 +194,30 @@ class Comparison:
         """What the optima leave that know of a failure from its strike on."""
         return known_optima(self.env_id, ROCKETS[self.env_id], self.failing, self.eval_seed, self.n)
 
+    def best(self) -> Known:
+        """`known`, and of the healthy ones among the first flights what their own optimum leaves."""
+        known = Known(*(values.copy() for values in self.known()))
+        is_healthy = self.vehicles(self.draws(self.solved)).failure[0] < 0
+        for k in np.flatnonzero(is_healthy):
+            if optimum := self.optima[k]:
+                known.mass[k], known.price[k] = optimum["final_mass"], optimum["orbit_price"]
+        return known
+
     def flights_by_loss(self) -> dict:
         """The arrays of opponents.npz: each flight's failure, what could be saved of it, and how each competitor ended.
 
-        `failure` (n, 3), `best_mass_kg` (n,), what the optimum leaves that knows of it, and `dry_mass_kg` (n,); of each
-        competitor's flights, the first ones, `<name>_error_norm`, `<name>_final_mass_kg` and `<name>_mass_reached_kg`,
-        what the same optimum leaves in the orbit reached.
+        `failure` (n, 3), `best_mass_kg` (n,), what the optimum leaves that knows of it (NaN of the healthy flights but
+        the first ones), and `dry_mass_kg` (n,); of each competitor's flights, the first ones, `<name>_error_norm`,
+        `<name>_final_mass_kg` and `<name>_mass_reached_kg`, what the same optimum leaves in the orbit reached.
         """
-        vehicles, known = self.vehicles(self.draws(self.n)), self.known()
-        arrays = {"failure": vehicles.failure.T, "best_mass_kg": known.mass, "dry_mass_kg": vehicles.dry_mass}
+        vehicles, best = self.vehicles(self.draws(self.n)), self.best()
+        arrays = {"failure": vehicles.failure.T, "best_mass_kg": best.mass, "dry_mass_kg": vehicles.dry_mass}
         for name, ends in self.arrays.items():
             error = ends["final_error"]
             arrays[f"{name}_error_norm"] = np.linalg.norm(error, axis=1)
             arrays[f"{name}_final_mass_kg"] = ends["final_y"][:, 6]
-            arrays[f"{name}_mass_reached_kg"] = known.first(len(error)).mass_at(error, self.rocket)
-        return {name: values.astype(np.float32) for name, values in arrays.items()}
+            arrays[f"{name}_mass_reached_kg"] = best.first(len(error)).mass_at(error, self.rocket)
+        return arrays
 
     def shares(self, name: str, reached: list) -> dict:
         """A competitor's mass over that of the optimum that knows the draw: to the target, and to the orbit `reached`.
@@ -232,7 +247,10 @@ class Comparison:
         for k, (name, about) in enumerate(self.about.items()):
             shares = self.shares(name, reached[k * self.solved : (k + 1) * self.solved])
             competitors[name] = about | self.metrics(name, self.n) | {"first": self.metrics(name, self.solved)} | shares
-        return report | {"laws": competitors}
+        report["laws"] = competitors
+        if self.failures:
+            report["by_loss"] = loss_report(self.flights_by_loss(), list(self.arrays), self.failures["failure"])
+        return report
 
 
 def recorded_flights(arrays: dict, rocket: Rocket, dispersion: float) -> dict:
@@ -253,6 +271,7 @@ def recorded_flights(arrays: dict, rocket: Rocket, dispersion: float) -> dict:
 COLUMNS = ("flights", "||error|| median", "p95", "max", "perigee off (km)", "in the box (95 %)", "mass (kg)")
 COLUMNS += ("of the bound", "orbit reached", "a decision", "knows")
 WIDTHS = (7, 16, 8, 8, 16, 24, 9, 14, 14, 10, 0)
+WHEN = {"random": "from a random moment of a burn on", "ignition": "from the last stage's ignition on"}
 
 
 def table(report: dict) -> str:
@@ -285,8 +304,8 @@ def failure_lines(report: dict) -> list[str]:
     """The table of the flights with a failure, a line a competitor; none where there are none."""
     if "failure" not in report:
         return []
-    when = {"random": "from a random moment of a burn on", "ignition": "from the last stage's ignition on"}
-    lines = [f"Flights with a failure, up to {report['failure']:.0%} of thrust lost {when[report['failure_time']]}"]
+    when = WHEN[report["failure_time"]]
+    lines = [f"Flights with a failure, up to {report['failure']:.0%} of thrust lost {when}"]
     columns = {
         "failure_starts": ("flights", "g"),
         "failure_savable": ("savable", "g"),
@@ -302,7 +321,7 @@ def failure_lines(report: dict) -> list[str]:
     for name, *others in rows:
         cells = (f"  {cell:>{max(len(head), 8)}}" for cell, head in zip(others, rows[0][1:]))
         lines.append(f"  {name:<{width}}" + "".join(cells))
-    return lines
+    return lines + loss_lines(report["by_loss"])
 
 
 def share(entry: dict, name: str, known: int) -> str:
@@ -350,9 +369,7 @@ def duration(microseconds: float | None) -> str:
 def check(env_id: str, folder: Path, n: int, solved: int, checkpoints: dict):
     """BadInput, before anything is flown, where the flags do not fit a results folder of this id."""
     refuse_unless(ROCKETS[env_id].cutoff, f"the env_id of {folder}", env_id, "must be a rocket's with cut-off")
-    most = min(n, AT_ONCE)
-    allowed = f"must be at most {most}: --starts is {n}, a batch {AT_ONCE}"
-    refuse_unless(solved <= most, "--solved", solved, allowed)
+    refuse_unless(solved <= n, "--solved", solved, f"must be at most {n}, as --starts is")
     for path in checkpoints.values():
         other = read_checkpoint(path, {}, flag="")["args"]["env_id"]
         refuse_unless(other == env_id, f"the env_id of {path}", other, f"must be {env_id}, as that of {folder}")
@@ -372,8 +389,8 @@ def compare(
 ):
     """Compare a results folder's policy, and those of `also` (name, path), with all opponents; print and write it.
 
-    opponents.json and figures/opponents.png, with failures also opponents.npz (`flights_by_loss`), are written when all
-    is flown. OSError or ValueError says what is bad.
+    opponents.json and figures/opponents.png, with failures also opponents.npz (`flights_by_loss`) and
+    figures/opponents_by_loss.png, are written when all is flown. OSError or ValueError says what is bad.
     """
     check_failure(failure, failure_time, ROCKETS[env_id].cutoff)
     checkpoints = {"policy": folder / "agent.safetensors"}
@@ -393,13 +410,15 @@ def compare(
         labelled[label] = chosen(arrays, healthy(arrays))
 
     from drawing.style import save_figures
-    from rocket.figures import dispersed_figure
+    from rocket.figures import dispersed_figure, losses_figure
 
     title = f"{env_id} at dispersion {dispersion:g}"
-    figure = dispersed_figure(comparison.rocket, labelled, title)
+    figures = {"opponents.png": dispersed_figure(comparison.rocket, labelled, title)}
     if failure:
-        write_npz(folder / "opponents.npz", comparison.flights_by_loss())
+        figures["opponents_by_loss.png"] = losses_figure(report["by_loss"], f"{title}, {WHEN[failure_time]}")
+        arrays = {key: values.astype(np.float32) for key, values in comparison.flights_by_loss().items()}
+        write_npz(folder / "opponents.npz", arrays)
     write_json(folder / "opponents.json", report)
     print(table(report))
-    for path in save_figures(folder / "figures", {"opponents.png": figure}):
+    for path in save_figures(folder / "figures", figures):
         print(path)

@@ -1,13 +1,17 @@
-"""The rocket's figures: the ascent, its orbit, and where dispersed flights end."""
+"""The rocket's figures: the ascent, its orbit, where dispersed flights end, and what laws save of failures."""
 
 from __future__ import annotations
+
+import itertools
 
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Rectangle
+from scipy.stats import binomtest
 
 from drawing.style import BOUNDARY, OPTIMUM, POLICY, TARGET
+from rocket.losses import STANDARD
 from rocket.metrics import BOX, altitude_km, element_misses, final_elements
 from rocket.missions import Mission
 from rocket.orbits import local_frame, orbit_vectors, target_axes, target_orbit
@@ -216,5 +220,46 @@ def dispersed_figure(rocket: Rocket, flights: dict[str, dict], title: str) -> Fi
     handles, names = distribution.get_legend_handles_labels()
     handles.append(Line2D([], [], **TARGET))
     figure.legend(handles, [*names, "a launcher's accuracy"], loc="outside lower center", ncols=min(len(handles), 5))
+    figure.suptitle(title)
+    return figure
+
+
+def losses_figure(report: dict, title: str) -> Figure:
+    """The share saved of the savable flights over the share of thrust lost, and kilograms beside the standard law.
+
+    report: `losses.loss_report`. A group of flights stands at the middle of its losses, its bars are 95 % intervals: of
+    a share by Wilson, of a difference the paired one. The group above `LARGE` is left out: others hold its flights.
+    """
+    figure = Figure(figsize=(12, 5), layout="constrained")
+    share, kilograms = figure.subplots(1, 2)
+    places = {"0": 0.0}
+    for label in report:
+        low, between, high = label.partition(" to ")
+        if between:
+            places[label] = (float(low.rstrip("%")) + float(high.rstrip("%"))) / 2
+    names = list(report["0"])
+    for k, (name, colour) in enumerate(zip(names, itertools.cycle(COLOURS))):
+        aside = 0.12 * (k - (len(names) - 1) / 2)  # points that coincide would hide one another
+        style = {"color": colour, "marker": "o", "markersize": 4, "linewidth": 1.0, "capsize": 2, "label": name}
+        rows = [(place + aside, report[label][name]) for label, place in places.items()]
+        saved = [(x, row["saved"], row["savable"]) for x, row in rows if row["savable"]]
+        if saved:
+            bounds = np.array([binomtest(hits, flights).proportion_ci(method="wilson") for _, hits, flights in saved])
+            rate = np.array([hits / flights for _, hits, flights in saved])
+            share.errorbar([x for x, *_ in saved], 100 * rate, 100 * np.abs(bounds.T - rate), **style)
+        pairs = [(x, row["against"]) for x, row in rows if "mass_kg" in row.get("against", {})]
+        if pairs:
+            x = [place for place, _ in pairs]
+            mean, low, high = (
+                np.array([pair[f"mass_kg{part}"] for _, pair in pairs]) for part in ("", "_low", "_high")
+            )
+            kilograms.errorbar(x, mean, [mean - low, high - mean], **style)
+    share.set(ylabel="saved of the savable (%)")
+    kilograms.set(ylabel=f"kg more than {STANDARD}, where both saved")
+    for ax in figure.axes:
+        ax.set(xlabel="share of thrust lost (%)")
+        ax.grid(alpha=0.3)
+    handles, labels = share.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=min(len(handles), 5))
     figure.suptitle(title)
     return figure

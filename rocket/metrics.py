@@ -122,8 +122,10 @@ def chosen(arrays: dict, flights: np.ndarray) -> dict:
     return {key: value[flights] for key, value in arrays.items()}
 
 
-def evaluate_dispersed(env_id: str, policy, eval_seed: int, n: int, dispersion: float, **env_options):
-    """Fly `policy(obs (m, obs), t) -> action (m, 3)` on the first n draws of a seed, in batches of at most `AT_ONCE`.
+def evaluate_dispersed(
+    env_id: str, policy, eval_seed: int, n: int, dispersion: float, at_once: int = AT_ONCE, **env_options
+):
+    """Fly `policy(obs (m, obs), t) -> action (m, 3)` on the first n draws of a seed, in batches of at most `at_once`.
 
     Returns the `dispersed_...` metrics of eval.json and the arrays `draw` (n, k), `final_y` (n, 7) with the true mass,
     `final_t` (n,), `final_error` (n, 6). Flights that crash or run dry are counted, and are among the errors. With the
@@ -131,8 +133,8 @@ def evaluate_dispersed(env_id: str, policy, eval_seed: int, n: int, dispersion: 
     """
     rocket = env_options.get("rocket") or ROCKETS[env_id].rocket
     z, parts = draws(rocket, dispersion, eval_seed, n, env_options.get("failure", 0.0)), []
-    for first in range(0, n, AT_ONCE):
-        parts.append(fly_dispersed(env_id, policy, z[first : first + AT_ONCE], dispersion, **env_options))
+    for first in range(0, n, at_once):
+        parts.append(fly_dispersed(env_id, policy, z[first : first + at_once], dispersion, **env_options))
     flights = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
     names = ("final_y", "final_t", "final_error", "failure")
     arrays = {"draw": z} | {key: flights[key] for key in names if key in flights}

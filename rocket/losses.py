@@ -1,0 +1,176 @@
+"""What each law saves by the size of the loss, and the laws beside one another on the same flights.
+
+Flights are told apart by the share of thrust that they lose. Of each group a law has its share saved, the error, and
+the kilograms that it is short of the optimum that knows of the failure from its strike on. Two laws that flew the same
+draws are compared flight by flight: the interval is that of the mean of the differences (Student's t).
+Reading order: groups, one law, two laws, the report, the printed tables.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rocket.metrics import SUCCESS
+
+EDGES = (0.0, 0.05, 0.10, 0.20, 0.25, 0.30)  # shares of thrust lost
+LARGE = 0.15  # above it, knowing of a failure beforehand is worth most
+STANDARD = "replan_measured"  # the law that the others are compared with
+CONFIDENCE = 0.95
+
+
+class Ends(NamedTuple):
+    """How the first n of a law's flights ended, (n,) each."""
+
+    error: np.ndarray  # ||error||
+    short: np.ndarray  # kg less than the optimum has in the orbit reached; NaN where none is known
+
+    @classmethod
+    def of(cls, arrays: dict, name: str) -> Ends:
+        """Those of a law among the arrays of `Comparison.flights_by_loss`."""
+        short = arrays[f"{name}_mass_reached_kg"] - arrays[f"{name}_final_mass_kg"]
+        return cls(arrays[f"{name}_error_norm"], short)
+
+    @property
+    def saved(self) -> np.ndarray:
+        """Which flights reached the orbit."""
+        return self.error < SUCCESS
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Groups of flights
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def groups(failure: np.ndarray, largest: float) -> dict[str, np.ndarray]:
+    """Label -> which of the flights (n,) lose that share of thrust; failure (n, 3) as in `final_info`.
+
+    largest: the greatest share that is drawn. Healthy flights come first, those above `LARGE` last.
+    """
+    has_failed, lost = failure[:, 0] >= 0, failure[:, 2]
+    found = {"0": ~has_failed}
+    for low, high in zip(EDGES, EDGES[1:]):
+        if low < largest:
+            top = min(high, largest)
+            found[f"{low:.0%} to {top:.0%}"] = has_failed & (lost > low) & (lost <= high)
+    if LARGE < largest:
+        found[f"above {LARGE:.0%}"] = has_failed & (lost > LARGE)
+    return found
+
+
+def savable_flights(arrays: dict) -> np.ndarray:
+    """Which flights (n,) can reach the orbit: the healthy ones, and those whose optimum ends above the dry mass."""
+    is_healthy = arrays["failure"][:, 0] < 0
+    return is_healthy | (arrays["best_mass_kg"] > arrays["dry_mass_kg"])
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# One law, and two laws
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def summary(ends: Ends, savable: np.ndarray) -> dict:
+    """A law on the flights `savable` (n,) of a group; without a flight nothing but their number.
+
+    `short_mean_kg` is of those that it saved and whose optimum is known, `short_flights` of them.
+    """
+    flights = int(savable.sum())
+    if not flights:
+        return {"savable": 0}
+    saved = savable & ends.saved
+    known = saved & np.isfinite(ends.short)
+    errors = ends.error[savable]
+    found = {"savable": flights, "saved": int(saved.sum()), "saved_rate": saved.sum() / flights}
+    found |= {"error_median": np.median(errors), "error_p95": np.percentile(errors, 95)}
+    found["short_flights"] = int(known.sum())
+    if known.any():
+        found["short_mean_kg"] = ends.short[known].mean()
+    return {key: value if isinstance(value, int) else float(value) for key, value in found.items()}
+
+
+def paired(ends: Ends, others: Ends, savable: np.ndarray) -> dict:
+    """A law less another on the same flights `savable` (n,): the share saved, and kilograms where both saved."""
+    share = ends.saved[savable].astype(float) - others.saved[savable]
+    both = savable & ends.saved & others.saved
+    heavier = (others.short - ends.short)[both]
+    found = mean_interval(share, "saved_rate") | mean_interval(heavier[np.isfinite(heavier)], "mass_kg")
+    return found
+
+
+def mean_interval(values: np.ndarray, name: str) -> dict:
+    """`<name>_flights`, and of their mean the value and its interval, by Student's t: none below two values."""
+    found = {f"{name}_flights": len(values)}
+    if len(values) < 2:
+        return found
+    from scipy.stats import t
+
+    mean = values.mean()
+    half = t.ppf((1 + CONFIDENCE) / 2, len(values) - 1) * values.std(ddof=1) / np.sqrt(len(values))
+    return found | {name: float(mean), f"{name}_low": float(mean - half), f"{name}_high": float(mean + half)}
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The report
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def loss_report(arrays: dict, names: list[str], largest: float) -> dict:
+    """By the label of a group what each law does: `summary`, and `against` the standard law what `paired` has.
+
+    arrays: those of `Comparison.flights_by_loss`. A law is measured on all that it flew, and compared on the first
+    flights, which both flew.
+    """
+    savable = savable_flights(arrays)
+    laws = {name: Ends.of(arrays, name) for name in names}
+    standard = laws[STANDARD]
+    report = {}
+    for label, group in groups(arrays["failure"], largest).items():
+        rows = {}
+        for name, ends in laws.items():
+            rows[name] = summary(ends, (group & savable)[: len(ends.error)])
+            both = min(len(ends.error), len(standard.error))
+            first, others = (Ends(*(values[:both] for values in law)) for law in (ends, standard))
+            if name != STANDARD:
+                rows[name]["against"] = paired(first, others, (group & savable)[:both])
+        report[label] = rows
+    return report
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Tables
+# ---------------------------------------------------------------------------------------------------------------------
+
+COLUMNS = ("savable", "saved", "||error|| median", "p95", "short (kg)", "saved, points", "kg, both saved")
+WIDTHS = (7, 7, 16, 8, 10, 22, 24)
+
+
+def loss_lines(report: dict) -> list[str]:
+    """`loss_report` in lines: a table for each group of flights."""
+    lines = ["By the share of thrust lost: of the savable flights, and beside them less " + STANDARD]
+    lines.append("  on the flights that both flew, with 95 % intervals (paired, Student's t)")
+    for label, laws in report.items():
+        heads = "".join(f"  {head:>{width}}" for head, width in zip(COLUMNS, WIDTHS))
+        title = "no failure" if label == "0" else f"{label} lost"
+        lines.append(f"  {title:<22}{heads}")
+        lines += [f"    {name:<20}" + law_cells(law) for name, law in laws.items()]
+    return lines
+
+
+def law_cells(law: dict) -> str:
+    """A law's cells."""
+    if not law["savable"]:
+        return f"  {0:>{WIDTHS[0]}}"
+    short = f"{law['short_mean_kg']:.2f}" if "short_mean_kg" in law else "-"
+    cells = [f"{law['savable']}", f"{law['saved_rate']:.1%}", f"{law['error_median']:.6f}", f"{law['error_p95']:.6f}"]
+    against = law.get("against", {})
+    cells += [short, interval(against, "saved_rate", 100, ".1f"), interval(against, "mass_kg", 1, ".2f")]
+    return "".join(f"  {cell:>{width}}" for cell, width in zip(cells, WIDTHS))
+
+
+def interval(found: dict, name: str, factor: float, form: str) -> str:
+    """A difference with its interval, "-" where there is none."""
+    if name not in found:
+        return "-"
+    mean, low, high = (format(factor * found[f"{name}{part}"], f"+{form}") for part in ("", "_low", "_high"))
+    return f"{mean} ({low} to {high})"
