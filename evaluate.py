@@ -115,8 +115,10 @@ def shorten(run_dir) -> Path:
             write_bytes(staged / path.name, path.read_bytes())
         policy = staged / "agent.safetensors"
         write_bfloat16(run_dir / "agent.safetensors", policy)
-        flags = {"checkpoint": policy, "eval-npz": staged / "eval.npz", "eval-json": staged / "eval.json"}
+        flags: dict = {"checkpoint": policy, "eval-npz": staged / "eval.npz", "eval-json": staged / "eval.json"}
         flags |= {name: args[name] for name in ("dispersion", "failure") if name in args}
+        if args.get("navigation_noise"):
+            flags["navigation-noise"] = " ".join(str(sigma) for sigma in args["navigation_noise"])
         command = [sys.executable, script, "--eval-only", "--no-cuda", *(f"--{name}={flags[name]}" for name in flags)]
         flown = subprocess.run(command, stderr=subprocess.PIPE, text=True)
         if flown.returncode:
@@ -288,6 +290,7 @@ def opponents_command(args):
         dispersion=args.dispersion,
         failure=args.failure,
         failure_time=args.failure_time,
+        navigation_noise=args.navigation_noise,
         n=args.starts or task.default_flights(is_brief=False, dispersion=args.dispersion),
         solved=args.solved,
         eval_seed=args.eval_seed,
@@ -358,6 +361,8 @@ def parse_args(argv=None):
     command.add_argument("--failure", type=number(0, 0.3), default=0.0, metavar="K", help=lost)
     strikes = "when these strike: random (default) or ignition"
     command.add_argument("--failure-time", default="random", metavar="WHEN", help=strikes)
+    sigma, off = number(0, 1e4), "noise of what laws and policies see of position and velocity: default none"
+    command.add_argument("--navigation-noise", nargs=2, type=sigma, metavar=("M", "M/S"), help=off)
     size = integer(10, 100_000)
     command.add_argument("--starts", type=size, metavar="N", help="flights (default: as many as an evaluation has)")
     command.add_argument(

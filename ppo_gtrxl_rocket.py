@@ -36,7 +36,7 @@ from cuda_graphs import speed_up
 from envs import ROCKETS
 from rocket.policy_constants import DIFFERENCES, policy_constants
 from rocket.rewards import TERMINAL_SCALE, mass_rewards
-from runs import Schedule, all_reduce_sum
+from runs import Numbers, Schedule, all_reduce_sum
 
 
 @dataclass
@@ -77,6 +77,7 @@ class Args:
     observe_mass: bool = False  # show the true mass of a drawn rocket, not the flight computer's
     failure: float = 0.0  # half of the flights lose thrust, by up to this share, in one of their burns (with cut-off)
     failure_time: str = "random"  # when: "random", or "ignition", the last stage's
+    navigation_noise: Numbers = None  # standard deviations, m and m/s, of the observed position and velocity
 
     # Table 1
     num_blocks: int = 6  # number of GTrXL blocks (0: a plain MLP, without memory)
@@ -187,7 +188,7 @@ def recipe(args):
 # Problem: input and action (features, frame and first action are ours) ------------------------------------------------
 ENV_IDS = tuple(ROCKETS)
 ENV_OPTIONS = (  # arguments of the environments
-    "observe_phase", "dispersion", "observe_draw", "observe_mass", "failure", "failure_time",
+    "observe_phase", "dispersion", "observe_draw", "observe_mass", "failure", "failure_time", "navigation_noise",
 )  # fmt: skip
 FIXED_OPTIONS = {"action_frame": "local"}  # those that no flag sets: up, along-track, cross-track
 BUFFERS = {env_id: policy_constants(mission.rocket) for env_id, mission in ROCKETS.items()}  # read as agent.<name>
@@ -355,7 +356,8 @@ def before_training(agent, args, env_options):
     begins = has_draws(args) and args.checkpoint is not None and args.resume is None and not args.eval_only
     if not begins or agent.nominal_flight.any():  # a policy of a dispersed training has its nominal flight already
         return
-    envs = gym.make_vec(args.env_id, num_envs=1, **{**env_options, "dispersion": 0.0, "failure": 0.0})
+    exact = {**env_options, "dispersion": 0.0, "failure": 0.0, "navigation_noise": None}
+    envs = gym.make_vec(args.env_id, num_envs=1, **exact)
     fly_nominal(agent, agent.make_policy(envs.episode_steps), envs)
     draw = envs.single_observation_space.shape[0] - OBSERVED
     agent.encoder[0].weight[:, -(draw + len(DIFFERENCES)) :] = 0.0

@@ -68,6 +68,16 @@ Schedule = Annotated[
         str_from_instance=lambda value: str(value).split(),
     ),
 ]
+Numbers = Annotated[
+    list | None,
+    tyro.constructors.PrimitiveConstructorSpec(
+        nargs="*",
+        metavar="NUMBER ...",
+        instance_from_str=lambda words: [float(word) for word in " ".join(words).split()],
+        is_instance=lambda value: value is None or isinstance(value, list),
+        str_from_instance=lambda value: [str(number) for number in value or ()],
+    ),
+]
 RANGES = {  # lowest and highest value of every numeric flag; NaN and infinity are outside
     **dict.fromkeys(["seed", "eval_seed", "num_threads", "eval_every"], (0, 2**31 - 1)),
     **dict.fromkeys(["total_updates", "num_envs", "num_minibatches", "update_epochs"], (1, 10**6)),
@@ -85,7 +95,8 @@ RANGES = {  # lowest and highest value of every numeric flag; NaN and infinity a
 }
 RECIPE_WORDS = ("ours", "paper")
 NETWORK = ("num_blocks", "embed_dim", "num_heads", "memory_length", "mlp_dim", "hidden_dim")
-NOT_OF_A_CHECKPOINT = {"dispersion", "failure"}  # options of the environment: chosen anew for each run and evaluation
+# options of the environment: chosen anew for each run and evaluation
+NOT_OF_A_CHECKPOINT = {"dispersion", "failure", "navigation_noise"}
 MAY_DIFFER_FROM_A_CHECKPOINT = {"failure_probability", "failure_size", "failure_time"}  # else they are the file's
 MAY_CHANGE_ON_RESUME = {"resume", "cuda", "num_threads"}
 
@@ -677,7 +688,8 @@ def track(args, name):
 def training_state(args, modules, envs, progress):
     """All that a bit-exact resume needs, copied, so that training can go on while it is kept."""
     modules = {name: module.state_dict() for name, module in modules.items()}
-    rng = {"torch": torch.get_rng_state(), "envs": json.dumps(envs.np_random.bit_generator.state)}
+    rng = {"torch": torch.get_rng_state()}
+    rng |= {name: json.dumps(stream.bit_generator.state) for name, stream in envs.generators.items()}
     rng = all_gather({**rng, "cuda": torch.cuda.get_rng_state_all()})
     return copy.deepcopy({"args": {**asdict(args), "resume": None}, "progress": progress, "rng": rng, **modules})
 
@@ -696,7 +708,8 @@ def restore(state, run_dir, modules, envs):
         rng = state["rng"][rank_and_world_size()[0]]
         torch.set_rng_state(rng["torch"])
         torch.cuda.set_rng_state_all(rng["cuda"][: torch.cuda.device_count()])
-        envs.np_random.bit_generator.state = json.loads(rng["envs"])
+        for name, stream in envs.generators.items():
+            stream.bit_generator.state = json.loads(rng[name])
         return {name: state["progress"][name] for name in COUNTERS}
     except Exception as error:  # an edited file fails in many ways, all alike to the user
         allowed = "must be whole, and of the script and vehicle as they are"

@@ -115,6 +115,11 @@ class BatchedEnv(Sealed, VectorEnv):
         return 1.0
 
     @property
+    def generators(self) -> dict[str, np.random.Generator]:
+        """The streams of random numbers, by name: a resumed training puts the states of all of them back."""
+        return {"envs": self.np_random}
+
+    @property
     def phase(self) -> np.ndarray:
         """The 0-based phase (N,) of the running steps."""
         return np.zeros(self.num_envs, dtype=np.int64)
@@ -250,8 +255,9 @@ class SingleEnv(Sealed, gym.Env):
         self._running = False  # also where the options are refused
         if options and "x0" in options:
             options = {**options, "x0": np.asarray(options["x0"])[None]}
-        if options and "draw" in options:
-            options = {**options, "draw": [options["draw"]]}
+        for name in ("draw", "noise"):
+            if options and name in options:
+                options = {**options, name: [options[name]]}
         obs, info = self.batch.reset(seed=seed, options=options)
         self._running = True
         return obs[0], info

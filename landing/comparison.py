@@ -189,12 +189,15 @@ def compare(
     also=(),
     failure: float = 0.0,
     failure_time: str = "random",
+    navigation_noise=None,
 ):
     """Compare a results folder's policy, and those of `also` (name, path), with all laws; print, write opponents.json.
 
-    All meet the failures of the folder's eval.json. `dispersion`, `failure` and `failure_time` are a rocket's.
+    All meet the failures of the folder's eval.json. `dispersion`, `failure`, `failure_time` and `navigation_noise` are
+    a rocket's.
     """
     given = {"dispersion": (dispersion, 1.0), "failure": (failure, 0.0), "failure-time": (failure_time, "random")}
+    given["navigation-noise"] = (navigation_noise, None)
     for name, (value, default) in given.items():
         refuse_unless(value == default, f"--{name}", value, f"is no flag of {env_id}; leave it out")
     refuse_unless(solved <= n, "--solved", solved, f"must be at most --starts, {n}")

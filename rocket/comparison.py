@@ -24,6 +24,7 @@ from common.policies import evaluate_by_script
 from rocket import guidance
 from rocket.dispersion import draw_vehicles
 from rocket.failure import check_failure
+from rocket.kalman import Filtered
 from rocket.losses import loss_lines, loss_report
 from rocket.metrics import (
     AT_ONCE,
@@ -38,6 +39,7 @@ from rocket.metrics import (
     healthy,
 )
 from rocket.missions import ROCKETS
+from rocket.navigation import checked_noise, noise_metrics
 from rocket.rescue import Failing, Known, directions_at, failing_optima, known_optima
 from rocket.vehicle import Rocket
 
@@ -53,7 +55,9 @@ KNOWLEDGE = {  # what each opponent has to know
     "optimum": "the draw itself",
 }
 REPLANS = ("replan", "replan_measured", "replan_hint")
-SOLVING = (*REPLANS, "optimum")  # fly the first flights alone
+# what flies once more behind a Kalman filter where navigation is noisy
+FILTERED = {f"{name}_filtered": name for name in ("tvlqr_energy", "replan", "replan_measured")}
+SOLVING = (*REPLANS, "replan_filtered", "replan_measured_filtered", "optimum")  # fly the first flights alone
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -68,7 +72,12 @@ def knowledge(args: dict) -> str:
     return knows + (", the draw itself" if args.get("observe_draw") else "")
 
 
-def fly_checkpoint(path, dispersion: float, eval_seed: int, n: int, **failures):
+def flag_words(value) -> str:
+    """An option of the environment as its flag takes it."""
+    return " ".join(str(part) for part in value) if isinstance(value, tuple) else str(value)
+
+
+def fly_checkpoint(path, dispersion: float, eval_seed: int, n: int, **options):
     """A policy on the first n draws of a seed: the arrays of `evaluate_dispersed`, `knows` and `decision_us`.
 
     BadInput with the script's own line where it refuses.
@@ -77,7 +86,7 @@ def fly_checkpoint(path, dispersion: float, eval_seed: int, n: int, **failures):
     with tempfile.TemporaryDirectory() as folder:
         files = [Path(folder) / name for name in ("eval.json", "eval.npz")]
         flags = {"dispersion": dispersion, "eval-starts": n, "eval-seed": eval_seed}
-        flags |= {name.replace("_", "-"): value for name, value in failures.items()}
+        flags |= {name.replace("_", "-"): flag_words(value) for name, value in options.items()}
         flags |= {"eval-json": files[0], "eval-npz": files[1], "num-threads": 1}
         evaluate_by_script(POLICY_SCRIPT, path, flags)
         decision_us = json.loads(files[0].read_text())["decision_us"]
@@ -96,20 +105,22 @@ class Comparison:
     """Policies and opponents on the first `n` draws of a seed; what solves for each flight on the first `solved`.
 
     `arrays`: by name, those of `evaluate_dispersed`; `about`: by name, `knows` and `decision_us`. `failures` are the
-    options `failure` and `failure_time` of the environment, or none: then what is said of a competitor is of its
-    healthy flights, but for `failure_metrics`.
+    options `failure` and `failure_time` of the environment, or none: with them what is said of a competitor is of its
+    healthy flights, but for `failure_metrics`. `noise`: its option `navigation_noise`.
     """
 
-    def __init__(self, env_id: str, dispersion: float, eval_seed: int, n: int, solved: int, **failures):
+    def __init__(self, env_id: str, dispersion: float, eval_seed: int, n: int, solved: int, noise=None, **failures):
         self.env_id, self.rocket, self.dispersion = env_id, ROCKETS[env_id].rocket, dispersion
         self.eval_seed, self.n, self.solved = eval_seed, n, solved
         self.failures, self.failing = failures, Failing(dispersion, **failures)
+        self.noise = checked_noise(noise)
+        self.options = failures | ({"navigation_noise": self.noise} if self.noise else {})
         self.arrays, self.about, self.optima = {}, {}, []
 
     def fly_policies(self, checkpoints: dict):
         """Fly the policies of these files, name -> agent.safetensors; ValueError where one flew other draws."""
         z = self.draws(self.n)
-        fly = lambda path: fly_checkpoint(path, self.dispersion, self.eval_seed, self.n, **self.failures)  # noqa: E731
+        fly = lambda path: fly_checkpoint(path, self.dispersion, self.eval_seed, self.n, **self.options)  # noqa: E731
         with ThreadPoolExecutor(PROCESSES) as pool:  # each thread waits for a process
             for name, flown in zip(checkpoints, pool.map(fly, checkpoints.values())):
                 if not np.array_equal(flown[0]["draw"], z):
@@ -124,8 +135,13 @@ class Comparison:
         self.fly("tvlqr_energy", guidance.tvlqr(env_id, by_energy=True), self.n)
         z = draws(self.rocket, self.dispersion, self.eval_seed, self.solved)
         drawn = guidance.drawn_exhaust(self.rocket, self.dispersion, z)
-        for name, exhaust in zip(REPLANS, (None, guidance.nominal_exhaust(self.rocket), drawn)):
+        exhausts = dict(zip(REPLANS, (None, guidance.nominal_exhaust(self.rocket), drawn)))
+        for name, exhaust in exhausts.items():
             self.replan(name, exhaust)
+        if self.noise:
+            self.fly("tvlqr_energy_filtered", self.behind_filter(guidance.tvlqr(env_id, by_energy=True)), self.n)
+            self.replan("replan_filtered", None)
+            self.replan("replan_measured_filtered", exhausts["replan_measured"])
         if self.failures:
             self.optima = failing_optima(env_id, ROCKETS[env_id], self.failing, self.draws(self.solved), PROCESSES)
         else:
@@ -143,16 +159,25 @@ class Comparison:
         """
         at_once = n if name in SOLVING else AT_ONCE
         _, self.arrays[name] = evaluate_dispersed(
-            self.env_id, opponent, self.eval_seed, n, self.dispersion, at_once, **self.failures
+            self.env_id, opponent, self.eval_seed, n, self.dispersion, at_once, **self.options
         )
-        self.about[name] = {"knows": KNOWLEDGE[name]}
+        self.about[name] = {"knows": KNOWLEDGE[FILTERED.get(name, name)]}
+        if name in FILTERED:
+            self.about[name]["knows"] += ", the noise and the dispersion"
         if name not in SOLVING:
             self.about[name]["decision_us"] = decision_us(self.env_id, opponent)
 
+    def behind_filter(self, law):
+        """The law by the estimates of a Kalman filter."""
+        assert self.noise is not None
+        return Filtered(law, self.env_id, self.noise, self.dispersion)
+
     def replan(self, name: str, exhaust):
         """Fly `Replanning` on the first flights."""
-        with guidance.Replanning(self.env_id, PROCESSES, exhaust) as replanning:
-            self.fly(name, replanning, self.solved)
+        velocity_noise = self.noise[1] if self.noise else 0.0
+        with guidance.Replanning(self.env_id, PROCESSES, exhaust, velocity_noise) as replanning:
+            law = self.behind_filter(replanning) if name in FILTERED else replanning
+            self.fly(name, law, self.solved)
         self.about[name] |= {"solves": len(replanning.seconds), "solves_failed": replanning.failed}
         if replanning.seconds:
             self.about[name]["decision_us"] = 1e6 * float(np.median(replanning.seconds))
@@ -237,6 +262,7 @@ class Comparison:
     def report(self) -> dict:
         """What opponents.json holds: of each its metrics, those of its first flights (`first`), and `shares`."""
         report = {"env_id": self.env_id, "dispersion": self.dispersion, "eval_seed": self.eval_seed} | self.failures
+        report |= noise_metrics(self.noise)
         is_healthy = self.vehicles(self.draws(self.solved)).failure[0] < 0
         masses = [optimum["final_mass"] for optimum, counts in zip(self.optima, is_healthy) if optimum and counts]
         report["bound_flights"] = len(masses)
@@ -286,7 +312,7 @@ def table(report: dict) -> str:
             rows.append((f"{name}, the first", *cells(entry, entry["first"], known)))
     width = max(len(row[0]) for row in rows)
     draws = f"the draws of eval seed {report['eval_seed']}, the same for all"
-    lines = [f"{report['env_id']} at dispersion {report['dispersion']:g},{about} {draws}"]
+    lines = [f"{report['env_id']} at dispersion {report['dispersion']:g},{noise_words(report)}{about} {draws}"]
     for name, *others in rows:
         lines.append(f"  {name:<{width}}" + "".join(f"  {cell:>{w}}" for cell, w in zip(others, WIDTHS)))
     lines.append("  Shares: mean mass over that of the optimum that knows the draw, to the target and to the orbit")
@@ -294,10 +320,17 @@ def table(report: dict) -> str:
     lines.append(f"    that was reached, {flights}")
     if "bound_mass_mean_kg" in report:
         lines[-1] += f" To the target it leaves {report['bound_mass_mean_kg']:.2f} kg on average."
-    for name in REPLANS:
-        solves, failed = (competitors[name][key] for key in ("solves", "solves_failed"))
-        lines.append(f"  {name}: {solves} solves, {failed} failed.")
+    for name, entry in competitors.items():
+        if "solves" in entry:
+            lines.append(f"  {name}: {entry['solves']} solves, {entry['solves_failed']} failed.")
     return "\n".join([*lines, *failure_lines(report)])
+
+
+def noise_words(report: dict) -> str:
+    """The noise of navigation in words, " ... ,"; none where there is none."""
+    if "navigation_noise_m" not in report:
+        return ""
+    return f" seen with a noise of {report['navigation_noise_m']:g} m and {report['navigation_noise_m_s']:g} m/s,"
 
 
 def failure_lines(report: dict) -> list[str]:
@@ -386,6 +419,7 @@ def compare(
     also=(),
     failure: float = 0.0,
     failure_time: str = "random",
+    navigation_noise=None,
 ):
     """Compare a results folder's policy, and those of `also` (name, path), with all opponents; print and write it.
 
@@ -393,14 +427,15 @@ def compare(
     figures/opponents_by_loss.png, are written when all is flown. OSError or ValueError says what is bad.
     """
     check_failure(failure, failure_time, ROCKETS[env_id].cutoff)
+    noise = checked_noise(navigation_noise)
     checkpoints = {"policy": folder / "agent.safetensors"}
     for name, path in also:
-        is_new = name not in {*checkpoints, *KNOWLEDGE}
+        is_new = name not in {*checkpoints, *KNOWLEDGE, *FILTERED}
         refuse_unless(is_new, "the NAME of --also", name, "must be that of no other row")
         checkpoints[name] = path
     check(env_id, folder, n, solved, checkpoints)
     failures = {"failure": failure, "failure_time": failure_time} if failure else {}
-    comparison = Comparison(env_id, dispersion, eval_seed, n, solved, **failures)
+    comparison = Comparison(env_id, dispersion, eval_seed, n, solved, noise, **failures)
     comparison.fly_policies(checkpoints)
     comparison.fly_opponents()
     report, labelled = comparison.report(), {}
@@ -412,7 +447,7 @@ def compare(
     from drawing.style import save_figures
     from rocket.figures import dispersed_figure, losses_figure
 
-    title = f"{env_id} at dispersion {dispersion:g}"
+    title = f"{env_id} at dispersion {dispersion:g}{noise_words(report).rstrip(',')}"
     figures = {"opponents.png": dispersed_figure(comparison.rocket, labelled, title)}
     if failure:
         figures["opponents_by_loss.png"] = losses_figure(report["by_loss"], f"{title}, {WHEN[failure_time]}")

@@ -29,6 +29,8 @@ from rocket.dispersion import (
 from rocket.dynamics import ascent_dynamics
 from rocket.failure import FAILURE_DRAW, HEALTHY_DRAW, check_failure, failure_scores
 from rocket.missions import PAPER_MISSION, ROCKETS, Mission
+from rocket.navigation import LARGEST_SCORE as LARGEST_NOISE_SCORE
+from rocket.navigation import OBSERVED, checked_noise, deviations
 from rocket.orbits import (
     local_frame,
     orbit_vectors,
@@ -98,6 +100,11 @@ class RocketVectorEnv(BatchedEnv):
     "ignition" the last stage from its ignition on (`failure.py`). A draw then has four numbers more, from 0 to 1, named
     by `FAILURE_DRAW`; one of k scores alone is a healthy flight's. No observation shows them.
 
+    With `navigation_noise` (m, m/s) the observed r and v are off by normal numbers of these standard deviations, drawn
+    afresh for each component and step. The state itself, events, cut-off and rewards are exact. The noise has a stream
+    of its own: draws stay as they are without it. `reset(options={"noise": w})`, w (N, T, 6) standard scores of
+    `episode_steps` + 1 or more observations, gives it.
+
     With a `cutoff` mission (ours: the paper fixes the final time) the engine stops when, in the last phase, the energy
     reaches the target's: the root within the step, to 1e-10, ends the episode.
 
@@ -110,7 +117,7 @@ class RocketVectorEnv(BatchedEnv):
     i_deg raan_deg argp_deg final_mass_kg final_time_s max_altitude_km` (at the steps' ends), the parts' sums,
     `episodic_return`, `points` (`precision_points`), `crashed`; with dispersion or failures `draw` (N, k) and `dry`,
     out of fuel; with failures `failure` (N, 3): group of engines, moment (s) and share lost, of a healthy flight
-    -1, 0, 0.
+    -1, 0, 0; with navigation noise `final_y` (N, 7), the exact r, v and m.
 
     Attributes for training alone, to be set before a `reset`: `guidance` (whether R_guidance is charged),
     `flights_per_start` (`BatchedEnv`; of each draw of a `reset`) and `terminal_scale`, a curriculum: the *reward* pays
@@ -135,6 +142,7 @@ class RocketVectorEnv(BatchedEnv):
         observe_mass: bool = False,
         failure: float = 0.0,
         failure_time: str = "random",
+        navigation_noise: tuple[float, float] | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
     ):
         if action_frame not in ACTION_FRAMES:
@@ -153,6 +161,9 @@ class RocketVectorEnv(BatchedEnv):
         self.action_frame, self.observe_phase = action_frame, observe_phase
         self.dispersion, self.observe_draw, self.observe_mass = dispersion, observe_draw, observe_mass
         self.failure, self.failure_time = failure, failure_time
+        self.navigation_noise = checked_noise(navigation_noise)
+        self._noise = np.zeros((num_envs, 0, OBSERVED))  # standard scores of the running episodes' observations
+        self._noise_stream: tuple | None = None  # the seeded generator, and the noise's own
         self.mass_weight, self.trajectory_weight, self.guidance_weight, self.guidance = 0.0, 0.0, 0.1, False
         self.terminal_scale = TERMINAL_SCALE
         super().__init__(num_envs, 1, *self._spaces(), render_mode, autoreset_mode)
@@ -203,6 +214,7 @@ class RocketVectorEnv(BatchedEnv):
         r_max, v_max = reachable(self.rocket, self.dispersion, latest)
         scores = self._draw_bounds if self.observe_draw else []
         high = np.array([*[r_max] * 3, *[v_max] * 3, self._largest.mass[0], 1.0, 1.0, *scores])
+        high[:OBSERVED] += LARGEST_NOISE_SCORE * deviations(self.navigation_noise)
         low = -high
         low[6:9] = 0.0, min(0.0, 1 - latest / self.rocket.end_time), 0.0
         return Box(low, high, dtype=np.float64), Box(-1.0, 1.0, (3,), dtype=np.float64)
@@ -233,13 +245,18 @@ class RocketVectorEnv(BatchedEnv):
         return self._steps
 
     def _start(self, mask, options):
-        if options and not (self.has_draws and options.keys() == {"draw"}):
-            allowed = "the only one is 'draw'" if self.has_draws else "without dispersion a rocket has no options"
+        taken = ["draw"] * self.has_draws + ["noise"] * bool(self.navigation_noise)
+        if options.keys() - set(taken):
+            allowed = "without dispersion a rocket has no options"
+            if taken:
+                allowed = f"the only one is {taken[0]!r}" if len(taken) == 1 else "there are 'draw' and 'noise'"
             raise BadInput(f"reset options are {options!r}; {allowed}")
         if not 0 < self.terminal_scale < np.inf:
             raise ValueError(f"terminal_scale is {self.terminal_scale}; it must be positive and finite")
         if self.has_draws:
             self._launch(mask, options.get("draw"))
+        if self.navigation_noise:
+            self._draw_noise(mask, options.get("noise"))
         self.y[:, mask] = self.rocket.x0[:, None]
         self.y[6, mask] = self.vehicles.mass[mask]
         self._parts[:, mask] = self.u[:, mask] = 0.0
@@ -258,6 +275,42 @@ class RocketVectorEnv(BatchedEnv):
         for mine, new in zip(self.vehicles, drawn):
             mine[..., mask] = new
         self.episode_steps = max(self.episode_steps, int(self._set_ends(self.vehicles).max()))
+
+    @property
+    def generators(self) -> dict[str, np.random.Generator]:
+        """The streams of random numbers, by name."""
+        if not self.navigation_noise:
+            return super().generators
+        return super().generators | {"navigation": self._noise_generator()}
+
+    def _noise_generator(self) -> np.random.Generator:
+        """The noise's own stream, a child of the seeded one, which it leaves as it is."""
+        seeded = self.np_random
+        if self._noise_stream is None or self._noise_stream[0] is not seeded:
+            (child,) = seeded.spawn(1)
+            self._noise_stream = seeded, child
+        return self._noise_stream[1]
+
+    def _draw_noise(self, mask, given):
+        """The noise of the whole episodes that begin in `mask`: given (N, T, 6), else new."""
+        observations = self.episode_steps + 1
+        missing = observations - self._noise.shape[1]
+        if missing > 0:  # longer flights than before; those that are running end earlier
+            self._noise = np.pad(self._noise, ((0, 0), (0, missing), (0, 0)))
+        if given is None:
+            self._noise[mask] = self._noise_generator().standard_normal((int(mask.sum()), *self._noise.shape[1:]))
+            return
+        allowed = f"must hold finite numbers, of shape ({self.num_envs}, T, {OBSERVED}), T at least {observations}"
+        try:
+            noise = np.array(given, dtype=np.float64)
+        except (TypeError, ValueError):
+            noise = np.empty(0)
+        shape: tuple[int, ...] = noise.shape
+        fits = len(shape) == 3 and shape[::2] == (self.num_envs, OBSERVED) and shape[1] >= observations
+        refuse_unless(fits, "options['noise']", f"of shape {shape}", allowed)
+        bad = noise[~np.isfinite(noise)]
+        refuse_unless(not len(bad), "an entry of options['noise']", bad[:1].sum(), allowed)
+        self._noise[mask, :observations] = noise[mask, :observations]
 
     def _scores(self, n):
         """Draws (n, k). Those of groups come in pairs, z and -z: few draws then have no mean of their own."""
@@ -307,6 +360,8 @@ class RocketVectorEnv(BatchedEnv):
     def _observe(self):
         obs = np.empty((self.num_envs, *self.single_observation_space.shape))
         obs[:, :7] = self.y.T
+        if self.navigation_noise:
+            obs[:, :OBSERVED] += deviations(self.navigation_noise) * self._noise[self._everyone, self.t]
         if self.observe_draw:
             obs[:, 9:] = self.draw[:, : self._scores_drawn]
         if self.has_draws and not self.observe_mass:
@@ -510,6 +565,8 @@ class RocketVectorEnv(BatchedEnv):
             info |= {"draw": self.draw.copy(), "dry": self.time >= self.vehicles.burn_out - 1e-6}
         if self.failure:
             info["failure"] = self.vehicles.failure.T.copy()
+        if self.navigation_noise:
+            info["final_y"] = y.copy()
         return info | dict(zip(self.PARTS, self._parts.copy())) | {"episodic_return": self._parts.sum(axis=0)}
 
     def _snapshot(self):
@@ -574,10 +631,13 @@ def make_rocket(env_id: str, **options) -> RocketEnv:
     return RocketEnv(make_rocket_vector(env_id, **options)).sealed()
 
 
-def fly_rocket(env_id: str, policy: Callable, end_time: float | None = None, draw=None, **options) -> dict:
+def fly_rocket(
+    env_id: str, policy: Callable, end_time: float | None = None, draw=None, noise: Callable | None = None, **options
+) -> dict:
     """Fly `policy(obs (1, obs), t) -> action (1, 3)` once, to `end_time` (s) at the latest, and record what happened.
 
-    draw (k,): the vehicle's standard scores and its failure, with the options `dispersion` and `failure`.
+    draw (k,): the vehicle's standard scores and its failure, with the options `dispersion` and `failure`. noise(T): the
+    standard scores (1, T, 6) of its observations, with the option `navigation_noise`; else they are random.
 
     Returns t (K+1,) s, u (K, 3) the unit directions in ECI, y (K+1, 7) r, v, m, reward (K,), `parts` (K, 5), the sums
     so far of the reward's `PARTS`, and the last step's info.
@@ -585,7 +645,10 @@ def fly_rocket(env_id: str, policy: Callable, end_time: float | None = None, dra
     env: Any = gym.make_vec(env_id, num_envs=1, **options)  # a RocketVectorEnv
     if end_time is not None:
         env.end_time = end_time
-    obs, _ = env.reset(options=None if draw is None else {"draw": [draw]})
+    given = {} if draw is None else {"draw": [draw]}
+    if noise is not None and env.navigation_noise:
+        given["noise"] = noise(env.episode_steps + 1)
+    obs, _ = env.reset(options=given)
     t, u, y, rewards, parts, final = [0.0], [], [env.y[:, 0].copy()], [], [], {}
     while not final:
         obs, reward, _, final = env.advance(policy(obs, len(u)))

@@ -8,6 +8,8 @@ project's interface.
 from __future__ import annotations
 
 import time
+from functools import partial
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -16,6 +18,7 @@ from rocket.dispersion import draw_bounds
 from rocket.environment import RocketVectorEnv, fly_rocket
 from rocket.failure import failure_scores
 from rocket.missions import ROCKETS, Mission
+from rocket.navigation import flight_noise
 from rocket.orbits import orbital_elements
 from rocket.vehicle import Rocket
 
@@ -134,7 +137,9 @@ def evaluate_dispersed(
     rocket = env_options.get("rocket") or ROCKETS[env_id].rocket
     z, parts = draws(rocket, dispersion, eval_seed, n, env_options.get("failure", 0.0)), []
     for first in range(0, n, at_once):
-        parts.append(fly_dispersed(env_id, policy, z[first : first + at_once], dispersion, **env_options))
+        batch = range(first, min(first + at_once, n))
+        noise = partial(flight_noise, eval_seed, batch)
+        parts.append(fly_dispersed(env_id, policy, z[batch.start : batch.stop], dispersion, noise, **env_options))
     flights = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
     names = ("final_y", "final_t", "final_error", "failure")
     arrays = {"draw": z} | {key: flights[key] for key in names if key in flights}
@@ -145,16 +150,23 @@ def evaluate_dispersed(
     return metrics | (dispersed_metrics(flights, rocket) if len(flights["error"]) else {}), arrays
 
 
-def fly_dispersed(env_id: str, policy, z: np.ndarray, dispersion: float, **env_options) -> dict:
-    """The ends of one batch of flights with the draws z (m, k): `final_info`'s arrays, `final_y` (m, 7) and others."""
-    batch = gym.make_vec(env_id, num_envs=len(z), dispersion=dispersion, **env_options)
-    obs, _ = batch.reset(options={"draw": z})
+def fly_dispersed(env_id: str, policy, z: np.ndarray, dispersion: float, noise=None, **env_options) -> dict:
+    """The ends of one batch of flights with the draws z (m, k): `final_info`'s arrays, `final_y` (m, 7) and others.
+
+    noise(T): the standard scores (m, T, 6) of the observations, with the option `navigation_noise`; else random.
+    """
+    batch: Any = gym.make_vec(env_id, num_envs=len(z), dispersion=dispersion, **env_options)
+    given = {"draw": z}
+    if noise is not None and batch.navigation_noise:
+        given["noise"] = noise(batch.episode_steps + 1)
+    obs, _ = batch.reset(options=given)
     alive, ends, t = np.ones(len(z), dtype=bool), {}, 0
     while alive.any():
         obs, _, terminated, _, info = batch.step(policy(obs, t))
         ended, t = alive & terminated, t + 1  # an ended environment has started anew; its first flight counts
         if ended.any():
-            final = {**info["final_info"], "final_y": info["final_obs"][:, :7]}
+            # with navigation noise what is observed is not the state, and the info has it
+            final = {"final_y": info["final_obs"][:, :7], **info["final_info"]}
             for key, value in final.items():
                 ends.setdefault(key, np.zeros_like(value))[ended] = value[ended]
         alive = alive & ~terminated

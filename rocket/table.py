@@ -47,6 +47,9 @@ def remarks(metrics: dict, mission: Mission) -> list[str]:
     stopped = abs(metrics.get("a_error_km", math.inf)) < 1e-3  # a crash or an empty tank may come first
     if mission.cutoff and stopped:
         lines.append("  With cut-off the engine stops at the target's orbital energy: a is exact because of this rule.")
+    if "navigation_noise_m" in metrics:
+        position, velocity = (metrics[f"navigation_noise_{unit}"] for unit in ("m", "m_s"))
+        lines.append(f"  Position and velocity are seen with a noise of {position:g} m and {velocity:g} m/s.")
     if "mass_ratio_reached" in metrics:
         mass = f"{metrics['reference_mass_reached_kg']:.3f} kg"
         lines.append(f"  The optimum for the five elements reached leaves {mass}: the measure of our mass.")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 from common.command_line import integer, number
 from common.errors import BadInput, refuse_unless
@@ -29,6 +30,7 @@ from rocket.metrics import (
     rocket_metrics,
 )
 from rocket.missions import ROCKETS, Mission
+from rocket.navigation import ALLOWED, NOMINAL_FLIGHT, flight_noise, is_noise, noise_metrics
 from rocket.optimum import kept_reference, reached_optimum
 from rocket.page import page as rocket_page
 from rocket.report import report_failures, report_rocket
@@ -90,8 +92,10 @@ class RocketTask:
         """
         if reference is None:
             reference = self.optimum(eval_seed, n, **env_options)
-        flight = fly_rocket(self.env_id, policy, **env_options)
+        noise = partial(flight_noise, eval_seed, [NOMINAL_FLIGHT])
+        flight = fly_rocket(self.env_id, policy, noise=noise, **env_options)
         metrics = {"env_id": self.env_id, "eval_seed": eval_seed, "eval_starts": 1}
+        metrics |= noise_metrics(env_options.get("navigation_noise"))
         metrics |= rocket_metrics(flight, reference, self.flown_with(**env_options).mission)
         arrays = {key: flight[key] for key in ("t", "u", "y", "reward")}
         arrays |= {f"{key}_reference": reference[key] for key in ("t", "u", "y")}
@@ -152,7 +156,11 @@ class RocketTask:
     def choices(self) -> dict[str, tuple[str, ...]]:
         return {"failure_time": FAILURE_TIMES}
 
-    def refusal(self, trains: bool, observe_phase: bool = True, failure: float = 0.0, **env_options):
+    def refusal(
+        self, trains: bool, observe_phase: bool = True, failure: float = 0.0, navigation_noise=None, **env_options
+    ):
+        if not is_noise(navigation_noise):
+            return "navigation_noise", ALLOWED
         if failure and not self.mission.cutoff:
             return "failure", NEEDS_CUTOFF
         if has_draws(failure=failure, **env_options) and trains and not observe_phase:
