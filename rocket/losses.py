@@ -94,8 +94,10 @@ def paired(ends: Ends, others: Ends, savable: np.ndarray) -> dict:
     share = ends.saved[savable].astype(float) - others.saved[savable]
     both = savable & ends.saved & others.saved
     heavier = (others.short - ends.short)[both]
-    found = mean_interval(share, "saved_rate") | mean_interval(heavier[np.isfinite(heavier)], "mass_kg")
-    return found
+    found = mean_interval(share, "saved_rate")
+    for bound in found.keys() & {"saved_rate_low", "saved_rate_high"}:
+        found[bound] = min(max(found[bound], -1.0), 1.0)
+    return found | mean_interval(heavier[np.isfinite(heavier)], "mass_kg")
 
 
 def mean_interval(values: np.ndarray, name: str) -> dict:
