@@ -269,6 +269,8 @@ def optimise_remaining(rocket: Rocket, remaining: RemainingAscent, guess: dict, 
     n, points, scale = sum(intervals), len(GAUSS_POINTS), state_scale(rocket)
     solve = remaining_solver(rocket, sum(intervals[:-1]), intervals[-1])
     ignition = np.append(remaining.begin, remaining.end)[-2]  # of the last arc
+    if not remaining.end[-1] > ignition:  # in dense air a measured flow can even be negative
+        raise NoOptimum(f"the remaining ascent from {remaining.begin} s: nothing is left to burn")
     t, t_u = remaining_grid(remaining, intervals, guess["t"][-1])
     states = interpolate(np.append(t[1:], t_u), guess["t"], guess["y"]) / scale
     directions = interpolate(t_u, guess["t_u"], guess["u"])

@@ -265,6 +265,22 @@ def test_a_failed_solve_keeps_the_last_plan(monkeypatch):
     assert law.failed == len(law.seconds) > 50
 
 
+@pytest.mark.parametrize("flow", [-0.01, 1e9])
+def test_a_measured_flow_that_leaves_nothing_to_burn_keeps_the_last_plan(flow):
+    """Low in the air, drag that differs can hide the thrust. Nothing but that flight's plan is lost."""
+    rocket, target = ROCKET, envs.target_orbit(ROCKET.target, ROCKET.mu)
+    y, guess = rocket_reference(CUTOFF)["y"][150], guidance.optimum_guess(CUTOFF)
+    now, mass, thrust = 300.0, np.array([y[6]]), np.array([1e5])
+    end = now + (mass - rocket.dry_mass) / flow
+    if flow > 0:
+        end = np.array([now])
+    remaining = guidance.RemainingAscent(now, y[:6], end, thrust, np.array([flow]), mass, *target)
+    with pytest.raises(NoOptimum, match="^the remaining ascent from 300.0 s: nothing is left to burn$"):
+        guidance.optimise_remaining(rocket, remaining, guess, (guidance.REPLAN_INTERVALS,))
+    plan, _ = guidance.replan_one((rocket, remaining, guess))
+    assert plan is None
+
+
 def test_the_optimum_that_knows_nothing_differs_is_the_reference():
     (optimum,) = guidance.drawn_optima(CUTOFF, 1.0, np.zeros((1, SCORES)))
     reference = rocket_reference(CUTOFF)

@@ -161,6 +161,7 @@ def test_flags_of_the_interface():
     assert all(set(words.split()) <= names for names in fields.values())
     small = {"log_radius", "observe_velocity"}
     rocket = {"guidance", "mass_weight", "dispersion", "observe_draw", "observe_mass", "failure", "failure_time"}
+    rocket.add("navigation_noise")
     assert fields[DI] == fields[VDP] == fields[ROCKET] - rocket | small
 
 
