@@ -11,7 +11,7 @@ from common.batch import make_batch
 from common.errors import BadInput
 from common.tasks import Interface, SampledTask
 
-KEPT_FLIGHTS = 100  # in a results folder
+KEPT_FLIGHTS = 30  # in a results folder
 SHOWN_FLIGHTS = 10  # in a figure
 
 

@@ -22,6 +22,7 @@ ROWS = {  # page: result folder -> its name
         "rocket_dispersed": "Cut-off, dispersed",
         "two_stage_leo": "Two stages",
     },
+    "ppo_gtrxl_lander": {"mars_landing": "Mars landing"},
 }
 TABLE = re.compile(r"(\| result \| .*\n\|[-|]+\|\n)(?:\|.*\n)*")  # head, then rows
 
@@ -32,6 +33,9 @@ def row(result, name):
     found = {key: np.array([seed[key] for seed in seeds]) for key in seeds[0] if all(key in seed for seed in seeds)}
     if "ratio_of_sums" in found:
         cells = [span(found["ratio_of_sums"], 4), span(100 * found["hit_rate"], 1) + " %"]
+    elif "landed_rate" in found:
+        cells = [span(100 * found["landed_rate"], 2) + " %", span(found["position_error_mean_m"], 2)]
+        cells += [span(found["fuel_ratio"], 3)]
     else:
         mass = found.get("mass_ratio_reached")
         cells = [span(found["error_norm"], 6), "–" if mass is None else span(100 * mass, 3) + " %"]

@@ -18,7 +18,7 @@ from phased.page import page as problem_page
 from phased.problem import Problem, flights_of_seed
 from phased.table import table
 
-KEPT_STARTS = 100  # in a results folder
+KEPT_STARTS = 30  # in a results folder
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,7 @@ PAGES += sorted((ROOT / "docs").rglob("*.md"))
 PAGES += sorted((ROOT / "results").rglob("README.md"))  # they hold the commands of all results
 each_page = pytest.mark.parametrize("page", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
 ROCKETS = ("rocket_fixed", "rocket_cutoff", "rocket_dispersed", "two_stage_leo")
+LANDERS = ("mars_landing",)
 OTHERS = ("di", "vdp", "di_waypoints", "vdp_waypoints")
 COUNTS = {1: "one", 2: "two", 3: "three", 4: "four", 5: "five"}
 
@@ -126,7 +127,7 @@ def row_of(result):
 
 def numbers_of(cell):
     """A cell's numbers, units included, and behind each its range (low, high), empty where it has none."""
-    return re.findall(r"([-−]?\d[\d.]*(?: %| kg|°)?)\** ?(?:\((\S+) to (\S+)\))?", cell)
+    return re.findall(r"([-−]?\d[\d.]*(?: %| kg| m|°)?)\** ?(?:\((\S+) to (\S+)\))?", cell)
 
 
 def seeds_of(result):
@@ -139,6 +140,9 @@ def measured(result, found):
     """What the cells "optimum" and "here" are of, in their order: (values, digits, unit) each."""
     if result in OTHERS:
         return [([1.0], 0, "")], [(found["ratio_of_sums"], 4, ""), (found["ratio_mean"], 4, "")]
+    if result in LANDERS:
+        here = [(100 * found["landed_rate"], 2, " %"), (found["position_error_mean_m"], 2, " m")]
+        return [(found["reference_fuel_mean_kg"], 1, " kg")], [*here, (found["fuel_ratio"], 3, "")]
     optimum, here = [(found["reference_error_norm"], 6, "")], [(found["error_norm"], 6, "")]
     if "dispersed_error_median" in found:
         best = json.loads((ROOT / "results" / result / "opponents.json").read_text())["laws"]["optimum"]
@@ -171,7 +175,7 @@ def test_the_front_page_says_how_many_flights_miss_a_circle():
     assert f"of all {1000 * len(rates)} flights {missed} miss one" in (ROOT / "README.md").read_text()
 
 
-@pytest.mark.parametrize("result", [*OTHERS, *ROCKETS])
+@pytest.mark.parametrize("result", [*OTHERS, *ROCKETS, *LANDERS])
 def test_the_front_page_says_what_the_results_hold(result):
     """Medians over the seeds, in order and nothing else; ranges wherever they are given."""
     found, row = seeds_of(result), row_of(result)

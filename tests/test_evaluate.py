@@ -541,7 +541,7 @@ def test_publish_ships_the_first_seed_and_adds_the_second(tmp_path, monkeypatch,
     assert (results / "agent.safetensors").read_bytes() == b"weights of seed 1"
 
 
-def test_a_results_folder_keeps_the_first_hundred_starts(tmp_path, monkeypatch):
+def test_a_results_folder_keeps_the_first_thirty_starts(tmp_path, monkeypatch):
     """Drawn of all, kept of some."""
     run, drawn = make_run(tmp_path / "a", seed=1), []
     with np.load(run / "eval.npz") as file:
@@ -554,7 +554,7 @@ def test_a_results_folder_keeps_the_first_hundred_starts(tmp_path, monkeypatch):
     with np.load(tmp_path / "results" / "eval.npz") as kept:
         assert drawn == [150] and kept.files == list(many)
         for key, array in many.items():
-            np.testing.assert_array_equal(kept[key], array if key == "t" else array[:100])
+            np.testing.assert_array_equal(kept[key], array if key == "t" else array[:30])
 
 
 def test_seeds_alone_say_of_which_problem_a_folder_is(tmp_path):
