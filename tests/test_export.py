@@ -146,7 +146,7 @@ def test_a_number_is_read_again_to_the_last_bit():
 def test_the_double_integrators_steps_are_its_closed_form(tmp_path):
     """From a row, with its control held, to the next: x2 + u dt, x1 + x2 dt + u dt^2 / 2."""
     found = table(exported("di", "csv", tmp_path))
-    flights, rows = 100, 51
+    flights, rows = 30, 51
     t, x1, x2, u = (found[name].reshape(flights, rows) for name in ("t_s", "x1", "x2", "u"))
     assert np.array_equal(found["flight"].reshape(flights, rows)[:, 0], np.arange(flights))
     dt = np.diff(t, axis=1)
@@ -160,11 +160,11 @@ def test_a_small_problems_flights_have_their_costs(tmp_path):
     """The table's J by its formula, of the rows of the steps."""
     steps = table(exported("di", "csv", tmp_path))
     flights = table(exported("di", "flights", tmp_path))
-    x, u = columns(steps, "x1", "x2").reshape(100, 51, 2), steps["u"].reshape(100, 51)[:, :-1]
+    x, u = columns(steps, "x1", "x2").reshape(30, 51, 2), steps["u"].reshape(30, 51)[:, :-1]
     cost = (x[:, :-1] ** 2).sum((1, 2)) + 0.1 * (u**2).sum(1) + 20 * (x[:, -1] ** 2).sum(1)
     np.testing.assert_allclose(flights["cost"], cost, rtol=1e-12)
     assert np.array_equal(columns(flights, "x1_end", "x2_end"), x[:, -1])
-    x0 = baselines.starts(0, 1000)[:100]
+    x0 = baselines.starts(0, 1000)[:30]
     assert np.array_equal(columns(flights, "x1_start", "x2_start"), x0)
     lqr = baselines.reference("DoubleIntegrator-v0", x0)
     np.testing.assert_allclose(flights["cost_of_optimum"], lqr["cost"], rtol=1e-9)
