@@ -146,8 +146,8 @@ OURS = {
 MARS = {
     **OURS,
     "thrust_share": 0.8,  # the rest is a reserve for failures that are worse than those of the training
-    "start_spread": 1.25,  # so is this: less thrust sideways is as if the pad were farther
-    "wind": "0:0.7 0.8:0.7 1:0.2",  # and this: a policy has to see its motion answer less than it expects
+    "start_spread": 1.4,  # so is this: less thrust sideways is as if the pad were farther and the start faster
+    "wind": "0:0.8 0.8:0.8 1:0.1",  # and this: a policy has to see its motion answer less than it expects
     "longest_flight": 60.0,  # flights of learned policies take 45 s
 }
 ONE_START = {  # all flights of an update are compared
