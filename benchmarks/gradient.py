@@ -410,7 +410,8 @@ def train_rocket(agent, env, recipe: Recipe, curve: Curve):
             correction = correction * (LONGEST / correction.norm()).clamp(max=1.0)
             theta.copy_(before + step - least_change(J_error @ step) + correction)
         vector_to_parameters(theta.clone(), weights)
-        curve.add(recipe, update, error_median=missed.median().item(), mass_mean_kg=100 * outcome[:, 6].mean().item())
+        of_errors = {"error_median": missed.median().item(), "error_max": missed.max().item()}
+        curve.add(recipe, update, **of_errors, mass_mean_kg=100 * outcome[:, 6].mean().item())
 
 
 # ---------------------------------------------------------------------------------------------------------------------
