@@ -83,6 +83,7 @@ def test_the_double_integrators_costs_are_the_environments():
     np.testing.assert_allclose(found, flight["cost"], rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [{}, {"dispersion": 1.0}], ids=["nominal", "drawn"])
 def test_steps_and_ends_are_the_environments(options):
     """Every step of flights to the orbit: three stagings, drawn vehicles, air and wind; then the cut-off, its time too.
@@ -141,6 +142,7 @@ def test_a_flight_out_of_propellant_goes_on():
 # --- derivative -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("num_blocks", [0, 1])
 def test_the_derivative_is_that_of_the_environments_flights(num_blocks, monkeypatch):
     """Central differences along a direction in the weights, of the outcome of drawn flights in the environments.
@@ -189,6 +191,7 @@ def test_the_cut_off_is_differentiated():
 # --- training ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_short_training_comes_nearer():
     """The environment flies the policy that was found; by flights that have crashed it is led no further astray."""
     env = rockets(1, rocket=COARSE)
@@ -227,6 +230,7 @@ def test_half_of_a_step_into_the_ground_is_taken_back(monkeypatch):
     assert 0.95 < agent.weight.item() < 1.02
 
 
+@pytest.mark.slow
 def test_a_training_of_the_double_integrator_costs_less():
     env, _ = gradient.make_envs(gradient.ROWS["di"], 64, 1)
     agent = agent_of(ppo_gtrxl_di, env, env_id="DoubleIntegrator-v0")
@@ -278,6 +282,7 @@ def test_a_record_is_a_line_of_the_table(tmp_path, monkeypatch, capsys):
         gradient.table(tmp_path)
 
 
+@pytest.mark.slow
 def test_the_saved_policy_flies_as_a_law_of_the_comparison(tmp_path, monkeypatch):
     """A dispersed training of one update: its file is one of the script's, which flies it on the draws of the laws."""
     short = {"recipe": gradient.Recipe(updates=1, flights=2, learning_rate=1e-3)}
