@@ -1,8 +1,8 @@
 """What it costs not to know the derivative: policies trained by the gradient through the physics, beside PPO's.
 
-    python benchmarks/gradient.py di --seed 1           # the double integrator: half a minute of one core
+    python benchmarks/gradient.py di --seed 1           # the double integrator: a minute of one core
     python benchmarks/gradient.py cutoff --seed 1       # the nominal rocket with cut-off: three minutes
-    python benchmarks/gradient.py dispersed --seed 1    # from there on, every flight another vehicle: six minutes
+    python benchmarks/gradient.py dispersed --seed 1    # from there on, every flight another vehicle: five minutes
     python benchmarks/gradient.py gtrxl --seed 1        # the nominal rocket by PPO's network with memory: ten minutes
     python benchmarks/gradient.py --table               # of what is in results/peers, with our PPO beside it
     python benchmarks/gradient.py dispersed --save runs/gradient.safetensors
@@ -548,8 +548,9 @@ def commit() -> str | None:
 
 
 def cell(values: list) -> str:
-    """The median of the seeds' values and their range, to five figures."""
-    low, middle, high = (f"{value:.5g}" for value in (min(values), np.median(values), max(values)))
+    """The median of the seeds' values and their range, to five figures, or all of a whole number."""
+    form = ".0f" if isinstance(values[0], int) else ".5g"
+    low, middle, high = (format(value, form) for value in (min(values), np.median(values), max(values)))
     return middle if min(values) == max(values) else f"{middle} ({low} to {high})"
 
 
@@ -563,14 +564,26 @@ def read(path: Path) -> dict:
 
 
 def ppo_runs(row: Row) -> list[dict]:
-    """The evaluations of our PPO's seeds on a row's problem, with the flights and minutes of each training."""
-    folder = ROOT / "results" / row.result
-    args = read_checkpoint(folder / "agent.safetensors", {}, flag="")["args"]
-    runs = [read_json(path) for path in sorted((folder / "seeds").glob("*.json"))]
-    return [
-        {**run, "flights": args["num_envs"] * run["total_updates"], "minutes": run["training_seconds"] / 60}
-        for run in runs
-    ]
+    """The evaluations of our PPO's seeds on a row's problem, with the flights and minutes of each training.
+
+    A dispersed training counts the shipped one of the nominal flight, with which each seed began.
+    """
+    folder, flights, seconds = ROOT / "results" / row.result, 0, 0.0
+    if row.start:
+        before = ROOT / "results" / ROWS[row.start].result
+        shipped = read_json(before / "eval.json")
+        flights, seconds = ppo_flights(before, shipped), shipped["training_seconds"]
+    runs = []
+    for path in sorted((folder / "seeds").glob("*.json")):
+        run = read_json(path)
+        minutes = (seconds + run["training_seconds"]) / 60
+        runs.append(run | {"flights": flights + ppo_flights(folder, run), "minutes": minutes})
+    return runs
+
+
+def ppo_flights(folder: Path, run: dict) -> int:
+    """The flights of a training of a results folder: all its seeds have the arguments of the shipped one."""
+    return run["total_updates"] * read_checkpoint(folder / "agent.safetensors", {}, flag="")["args"]["num_envs"]
 
 
 def table(folder: Path) -> list[list[str]]:
