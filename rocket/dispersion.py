@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from common.errors import refuse_unless
+from common.integration import exp
 from rocket.failure import Losses, drawn_losses, largest_failures, no_losses
 from rocket.vehicle import ROCKET, Rocket, engine_groups, engine_types
 
@@ -298,7 +299,7 @@ def nominal_vehicles(rocket: Rocket, number: int) -> Vehicles:
 def wind_velocity(place, wind, rocket: Rocket = ROCKET):
     """The wind in ECI, m/s by components, at (rx, ry, rz, |r|) in m; wind: (east, north) where the profile is 1."""
     rx, ry, rz, r = place
-    profile = np.exp(-(((r - (rocket.Re + WIND_ALTITUDE)) / WIND_DEPTH) ** 2))
+    profile = exp(-(((r - (rocket.Re + WIND_ALTITUDE)) / WIND_DEPTH) ** 2))
     axis = (rx * rx + ry * ry) ** 0.5 + 1e-9  # m from the Earth's axis; over a pole nothing is east, nor NaN
     east, north = profile * wind[0] / axis, profile * wind[1] / r
     south = north * rz / axis

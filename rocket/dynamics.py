@@ -1,9 +1,8 @@
-"""Equations of motion: x is a tuple of components, each a NumPy array over environments or a CasADi symbol."""
+"""Equations of motion: x is a tuple of components, NumPy arrays over environments, CasADi symbols or torch tensors."""
 
 from __future__ import annotations
 
-import numpy as np
-
+from common.integration import exp
 from rocket.dispersion import wind_velocity
 from rocket.vehicle import ROCKET, Rocket
 
@@ -32,7 +31,7 @@ def ascent_dynamics(x, u, rocket: Rocket = ROCKET, wind=None, drag_factor=None):
         relative_x = relative_x - blow_x
         relative_y = relative_y - blow_y
         relative_z = relative_z - blow_z
-    rho = rocket.rho0 * np.exp((rocket.Re - r) / rocket.H)
+    rho = rocket.rho0 * exp((rocket.Re - r) / rocket.H)
     if drag_factor is not None:
         rho = drag_factor * rho
     speed = (relative_x * relative_x + relative_y * relative_y + relative_z * relative_z) ** 0.5
