@@ -34,7 +34,7 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 import runs
 from cuda_graphs import speed_up
 from envs import ROCKETS
-from rocket.policy_constants import DIFFERENCES, policy_constants
+from rocket.policy_constants import DIFFERENCES, WIDE_DIFFERENCES, policy_constants
 from rocket.rewards import TERMINAL_SCALE, mass_rewards
 from runs import Numbers, Schedule, all_reduce_sum
 
@@ -157,12 +157,14 @@ DISPERSED = {  # replaces more, and goes on with a policy of the nominal flight
     "mass_weight": "0.1:0 0.2:0.2 0.5:0.2 0.85:0",
     "weight_average": 0.998,
 }
+FAILING = {**DISPERSED, "total_updates": 300}  # failures are many kinds of flights, and large ones are rare
 RECIPES = {"RocketAscent-v0": FIXED, "RocketAscentCutoff-v0": CUTOFF, "TwoStageLEO-v0": CUTOFF}
 FIRST_POLICY = {  # the policy with which a dispersed training begins, by environment id
     "RocketAscent-v0": "results/rocket_fixed/agent.safetensors",
     "RocketAscentCutoff-v0": "results/rocket_cutoff/agent.safetensors",
     "TwoStageLEO-v0": "results/two_stage_leo/agent.safetensors",
 }
+FIRST_OF_FAILING = {"RocketAscentCutoff-v0": "results/rocket_dispersed/agent.safetensors"}  # with failures it wins
 
 
 def has_draws(args):
@@ -176,13 +178,14 @@ def recipe(args):
     changes = RECIPES.get(args.env_id, family)
     if not has_draws(args):
         return changes
-    first_policy = args.checkpoint or FIRST_POLICY.get(args.env_id)
+    shipped = {**FIRST_POLICY, **(FIRST_OF_FAILING if args.failure else {})}
+    first_policy = args.checkpoint or shipped.get(args.env_id)
     if first_policy is None:
         flag = "--dispersion" if args.dispersion else "--failure"
         todo = f"train without {flag} first, and name that policy by --checkpoint"
         print(f"{flag}: no policy of {args.env_id} to begin with, so this training begins anew; better {todo}")
         return {**changes, "num_envs": DISPERSED["num_envs"], "flights_per_start": DISPERSED["flights_per_start"]}
-    return {**changes, **DISPERSED, "checkpoint": first_policy}
+    return {**changes, **(FAILING if args.failure else DISPERSED), "checkpoint": first_policy}
 
 
 # Problem: input and action (features, frame and first action are ours) ------------------------------------------------
@@ -288,6 +291,9 @@ def set_curriculum(envs, args, progress):
     R_terminal = -2 ln(1 + error / scale): below the scale all errors earn almost the same. Noise scatters the errors of
     the flights by about std / 10. So the scale falls with the noise, as std / 8, if --log-std is a schedule. It is at
     most TERMINAL_SCALE, and at least 0.001 where flights differ (less was no better).
+
+    Of failures at a random moment every second update flies those of the last stage at its ignition: the hardest to
+    save, and rare among random ones.
     """
     envs.terminal_scale = TERMINAL_SCALE
     if isinstance(args.log_std, str):
@@ -295,6 +301,9 @@ def set_curriculum(envs, args, progress):
         smallest = 0.001 if has_draws(args) else 0.0
         envs.terminal_scale = min(TERMINAL_SCALE, max(std / 8, smallest))
     envs.guidance = args.guidance
+    if args.failure and args.failure_time == "random":
+        updates_before = round(progress * (args.total_updates - 1))
+        envs.failure_time = "ignition" if updates_before % 2 else "random"
     group = round(value_at(args.flights_per_start, progress))
     envs.flights_per_start = group
     return group
@@ -351,16 +360,31 @@ def before_training(agent, args, env_options):
     """Before a dispersed training: let the policy that it begins with fly the nominal flight, and store that flight.
 
     The draw and the differences are new inputs to that policy. Their weights are set to 0, so at first it flies as
-    before.
+    before. Before a training with failures larger differences come into sight.
     """
     begins = has_draws(args) and args.checkpoint is not None and args.resume is None and not args.eval_only
-    if not begins or agent.nominal_flight.any():  # a policy of a dispersed training has its nominal flight already
+    if not begins:
+        return
+    if args.failure:
+        widen_differences(agent)
+    if agent.nominal_flight.any():  # a policy of a dispersed training has its nominal flight already
         return
     exact = {**env_options, "dispersion": 0.0, "failure": 0.0, "navigation_noise": None}
     envs = gym.make_vec(args.env_id, num_envs=1, **exact)
     fly_nominal(agent, agent.make_policy(envs.episode_steps), envs)
     draw = envs.single_observation_space.shape[0] - OBSERVED
     agent.encoder[0].weight[:, -(draw + len(DIFFERENCES)) :] = 0.0
+
+
+def widen_differences(agent):
+    """Let a policy see differences of the orbit that are ten times as large, before they are clipped.
+
+    The units grow, and with them the weights of what is seen in these units. So within the narrow clip the policy flies
+    as before, and beyond it goes on linearly.
+    """
+    wide = agent.differences.new_tensor(WIDE_DIFFERENCES)
+    agent.encoder[0].weight[:, -len(DIFFERENCES) :] *= wide / agent.differences
+    agent.differences.copy_(wide)
 
 
 def fly_nominal(agent, policy, envs):

@@ -98,6 +98,7 @@ NETWORK = ("num_blocks", "embed_dim", "num_heads", "memory_length", "mlp_dim", "
 # options of the environment: chosen anew for each run and evaluation
 NOT_OF_A_CHECKPOINT = {"dispersion", "failure", "navigation_noise"}
 MAY_DIFFER_FROM_A_CHECKPOINT = {"failure_probability", "failure_size", "failure_time"}  # else they are the file's
+CHANGED_BY_TRAINING = {"differences"}  # constants of an agent that a training may set anew
 MAY_CHANGE_ON_RESUME = {"resume", "cuda", "num_threads"}
 
 
@@ -430,7 +431,6 @@ def load_checkpoint(agent, args, saved):
     """Put the weights of --checkpoint, if there is one, into a new agent; one line if they do not fit."""
     if args.checkpoint is None or args.resume is not None:
         return
-    ours = dict(agent.named_buffers())
     expected = {name: tuple(tensor.shape) for name, tensor in agent.state_dict().items()}
     shapes = {name: array.shape for name, array in saved["tensors"].items()}
     if differing := [name for name in {**expected, **shapes} if expected.get(name) != shapes.get(name)]:
@@ -439,9 +439,8 @@ def load_checkpoint(agent, args, saved):
         why = f"{name} is {theirs} in the file and {here} in this script"
         todo = "train it anew, or fly it by the version that trained it (CHANGELOG.md)"
         fail(f"--checkpoint {args.checkpoint}: does not fit its own args, BUFFERS or features ({why}); {todo}")
-    for name, constant in ours.items():
-        learnt = not constant.any()  # zeros in a new agent
-        if not learnt and not torch.allclose(constant.cpu(), torch.from_numpy(saved["tensors"][name]), rtol=1e-6):
+    for name, constant in constants_of(agent).items():
+        if not torch.allclose(constant.cpu(), torch.from_numpy(saved["tensors"][name]), rtol=1e-6):
             print(f"--checkpoint {args.checkpoint}: its {name} is not that of {args.env_id} now; it flies by its own")
             break
     try:
@@ -452,6 +451,11 @@ def load_checkpoint(agent, args, saved):
         torch.nn.init.constant_(agent.actor_logstd, float(args.log_std))
     if not args.eval_only:
         print(f"begins with {args.checkpoint}, sha256 {hashlib.sha256(Path(args.checkpoint).read_bytes()).hexdigest()}")
+
+
+def constants_of(agent):
+    """The buffers of a new agent that no training changes, by name; one that a training fills is zeros in it."""
+    return {name: x for name, x in agent.named_buffers() if x.any() and name not in CHANGED_BY_TRAINING}
 
 
 def finite(values, epoch, minibatch):
@@ -697,9 +701,8 @@ def training_state(args, modules, envs, progress):
 def restore(state, run_dir, modules, envs):
     """Put everything back where `training_state` found it; returns the progress. One line if something does not fit."""
     try:
-        for name, constant in modules["agent"].named_buffers():
-            learnt = not constant.any()  # zeros in a new agent
-            if not learnt and not torch.allclose(constant.cpu(), state["agent"][name], rtol=1e-6):
+        for name, constant in constants_of(modules["agent"]).items():
+            if not torch.allclose(constant.cpu(), state["agent"][name], rtol=1e-6):
                 raise ValueError(f"{name} is not that of {state['args']['env_id']} now")
         for name, module in modules.items():
             module.load_state_dict(state[name])

@@ -3,6 +3,7 @@
     python benchmarks/run_seeds.py benchmarks/memory_di_jobs.txt --at-once 2 --numbers      # trains what is missing
     python benchmarks/run_seeds.py benchmarks/memory_nominal_jobs.txt --at-once 2           # the same: hours
     python benchmarks/run_seeds.py benchmarks/memory_rocket_jobs.txt --at-once 2 --numbers  # the same: hours
+    python benchmarks/run_seeds.py benchmarks/memory_failures_jobs.txt --at-once 2 --numbers  # the same: an hour
     python benchmarks/run_seeds.py benchmarks/memory_lander_jobs.txt --at-once 2 --numbers  # the same: hours
     python benchmarks/memory.py                                                             # prints, draws: seconds
     python benchmarks/memory.py --by-seed                                                   # a line for each run
@@ -70,7 +71,7 @@ def velocity_from_the_second_step():
 def rocket_rows(result):
     """The rocket's rows. L_mem 32 is the front page's result: its runs are not trained twice."""
     return {
-        **lengths(0, 8),
+        **lengths(0, 1, 8),
         f"../../{result}": "L_mem 32",
         **lengths(128),
         "mlp": "MLP of about the same size",
@@ -85,6 +86,13 @@ DISPERSED = {
     "dispersed_perigee_error_std_km": "perigee, sigma (km)",
     "dispersed_box_rate": "in the box",
     "dispersed_mass_mean_kg": "mass (kg)",
+}
+FAILED = {
+    "failure_saved_rate": "saved",
+    "failure_error_median": "median",
+    "failure_error_p95": "p95",
+    "failure_mass_short_mean_kg": "short (kg)",
+    "dispersed_error_median": "median, no failure",
 }
 LANDED = {
     "landed_rate": "landed",
@@ -136,6 +144,12 @@ EXPERIMENTS = {
         "Dispersed rocket, cut-off: ||error|| over 1705 flights",
         rocket_rows("rocket_dispersed"),
         DISPERSED,
+    ),
+    "failures": Experiment(
+        "Dispersed rocket with a loss of thrust at a random moment: share of the savable flights that are saved",
+        {**lengths(0, 1), "../../rocket_failures": "L_mem 32", "mlp": "MLP of about the same size"},
+        FAILED,
+        drawn=False,
     ),
     "lander": Experiment(
         "Landing, failure at a random moment, the last command shown: share of the flights that landed",

@@ -121,9 +121,9 @@ class RocketVectorEnv(BatchedEnv):
 
     Attributes for training alone, to be set before a `reset`: `guidance` (whether R_guidance is charged),
     `flights_per_start` (`BatchedEnv`; of each draw of a `reset`) and `terminal_scale`, a curriculum: the *reward* pays
-    R_terminal with it, `final_info` reports it with `TERMINAL_SCALE`. Our training leaves the others as they are:
-    `mass_weight` (a price per `mass_unit`), `trajectory_weight`, `guidance_weight` and `end_time` (s, at most the last
-    phase's end).
+    R_terminal with it, `final_info` reports it with `TERMINAL_SCALE`; and `failure_time`, "ignition" for a while where
+    it was "random". Our training leaves the others as they are: `mass_weight` (a price per `mass_unit`),
+    `trajectory_weight`, `guidance_weight` and `end_time` (s, at most the last phase's end).
     """
 
     metadata = {**BatchedEnv.metadata, **RENDERED}

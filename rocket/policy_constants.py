@@ -10,6 +10,8 @@ from rocket.vehicle import Rocket
 # sizes by which flights at dispersion 1 differ at the same energy of the same burn: the three components of
 # (h - h_T) / |h_T| and those of e - e_T, the logarithm of the observed mass, the angle flown in rad
 DIFFERENCES = [5e-5, 5e-5, 5e-5, 1e-4, 3e-4, 2e-5, 0.01, 0.004]
+# for flights that lose thrust: a quarter less of the last stage's moves the orbit by up to a hundred of those
+WIDE_DIFFERENCES = [10 * size for size in DIFFERENCES[:6]] + DIFFERENCES[6:]
 
 
 def policy_constants(rocket: Rocket) -> dict:
@@ -18,7 +20,8 @@ def policy_constants(rocket: Rocket) -> dict:
     `axes` (3, 3), rows towards the perigee, along the semi-latus rectum and normal to the plane; `units` (7,) of r, v
     and m (the Earth's radius, circular speed there, the dry mass); angular momentum `h_target` and eccentricity vector
     `e_target` (3,); `phases`, what is observed of each burn; `nominal_flight` (steps + 1, 10), rows of burn, specific
-    energy and what flights are compared by, which a dispersed training fills; `differences` (8,), the sizes of those.
+    energy and what flights are compared by, which a dispersed training fills; `differences` (8,), the sizes of those,
+    which a training with failures makes wide.
     """
     axes = target_axes(rocket)
     steps = int(np.ceil(rocket.end_time / rocket.dt))

@@ -188,6 +188,7 @@ def test_every_row_of_the_tables_has_its_three_jobs():
 
 CHANGED = {
     "memory_0": {"memory_length": 0},
+    "memory_1": {"memory_length": 1},
     "memory_8": {"memory_length": 8},
     "memory_128": {"memory_length": 128},
     "mlp": {"num_blocks": 0, "embed_dim": 192, "hidden_dim": 192},
@@ -196,15 +197,15 @@ CHANGED = {
 }
 
 
-def rocket_jobs(tmp_path, name, begun=()):
+def rocket_jobs(tmp_path, name, begun=(), policies="nominal", seeds=3):
     """The jobs of a list in benchmarks/, policies that are not shipped replaced by the flags that they began with."""
     text = (ROOT / "benchmarks" / name).read_text()
     for row in begun:
         flags = " ".join(
             f"--{key.replace('_', '-')} {'' if value is True else value}" for key, value in CHANGED[row].items()
         )
-        path = f"--checkpoint results/memory/nominal/{row}/agent.safetensors"
-        assert text.count(path) == 3
+        path = f"--checkpoint results/memory/{policies}/{row}/agent.safetensors"
+        assert text.count(path) == seeds
         text = text.replace(path, f"--env-id RocketAscentCutoff-v0 {flags}")
     (tmp_path / name).write_text(text)
     return run_seeds.read_jobs(tmp_path / name)
@@ -216,8 +217,8 @@ def test_the_rockets_rows_are_the_shipped_commands_but_for_what_they_say(tmp_pat
     shipped = {(job.results.name, job.args["seed"]): job.args for job in rocket_jobs(tmp_path, "result_jobs.txt")}
     nominal = rocket_jobs(tmp_path, "memory_nominal_jobs.txt")
     dispersed = rocket_jobs(tmp_path, "memory_rocket_jobs.txt", begun=CHANGED)
-    assert [job.args["seed"] for job in nominal] == [1] * 6
-    assert sorted(job.args["seed"] for job in dispersed) == [1] * 6 + [2] * 6 + [3] * 6
+    assert [job.args["seed"] for job in nominal] == [1] * 7
+    assert sorted(job.args["seed"] for job in dispersed) == [1] * 7 + [2] * 7 + [3] * 7
     for result, experiment, jobs in (("rocket_cutoff", "nominal", nominal), ("rocket_dispersed", "rocket", dispersed)):
         rows = set(memory.EXPERIMENTS[experiment].rows)
         assert rows == {f"../../{result}", *CHANGED} and {job.results.name for job in jobs} == set(CHANGED)
@@ -225,6 +226,20 @@ def test_the_rockets_rows_are_the_shipped_commands_but_for_what_they_say(tmp_pat
             theirs = shipped[result, job.args["seed"]]
             different = {key: value for key, value in job.args.items() if value != theirs[key] and key != "checkpoint"}
             assert different == CHANGED[job.results.name], shlex.join(job.command)
+
+
+def test_rows_with_failures_are_the_shipped_command_but_for_what_they_say(tmp_path, monkeypatch):
+    monkeypatch.chdir(ROOT)
+    shipped = [job.args for job in rocket_jobs(tmp_path, "result_jobs.txt") if job.results.name == "rocket_failures"]
+    assert [args["seed"] for args in shipped] == [1, 2, 3]
+    rows = ("memory_0", "memory_1", "mlp")
+    jobs = rocket_jobs(tmp_path, "memory_failures_jobs.txt", begun=rows, policies="rocket", seeds=1)
+    assert tuple(job.results.name for job in jobs) == rows
+    assert set(memory.EXPERIMENTS["failures"].rows) == {"../../rocket_failures", *rows}
+    for job in jobs:
+        different = {name: value for name, value in job.args.items() if value != shipped[0][name]}
+        different.pop("checkpoint", None)
+        assert different == CHANGED[job.results.name], shlex.join(job.command)
 
 
 def test_one_phase_is_flown_by_the_shipped_command_without_memory():

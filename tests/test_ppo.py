@@ -159,6 +159,21 @@ def test_the_rockets_curriculum(std, dispersion, scale):
     assert envs.flights_per_start == 1 and envs.terminal_scale == 0.005 and not envs.guidance
 
 
+@pytest.mark.parametrize("asked", ["random", "ignition"])
+def test_every_second_update_of_random_failures_flies_those_at_the_last_ignition(asked):
+    """As the flights tell it: the last group of engines, at one moment."""
+    rocket = importlib.import_module("ppo_gtrxl_rocket")
+    options = {"failure": 0.25, "failure_time": asked}
+    envs = gym.make_vec("RocketAscentCutoff-v0", num_envs=40, **options)
+    args = rocket.Args(**options, total_updates=300)
+    for before in (*range(6), 298, 299):
+        rocket.set_curriculum(envs, args, before / 299)
+        envs.reset(seed=before)
+        groups, moments, _ = envs.unwrapped.vehicles.failure[:, envs.unwrapped.vehicles.failure[0] >= 0]
+        at_ignition = set(groups) == {3} and np.ptp(moments) == 0
+        assert at_ignition == (asked == "ignition" or before % 2 == 1)
+
+
 @pytest.fixture
 def schedules(learner, asked, monkeypatch):
     """The entropy's coefficient, lambda and the learning rate that update `iteration` of 11 uses."""

@@ -217,6 +217,8 @@ def test_a_dispersed_training_begins_with_the_shipped_policy(monkeypatch, capsys
     monkeypatch.chdir(ROOT)
     args = dispersed()
     assert args.checkpoint == "results/rocket_cutoff/agent.safetensors" and args.log_std == "0:-3.5 1:-6.5"
+    failing = dispersed("--failure=0.25")
+    assert failing.checkpoint == "results/rocket_dispersed/agent.safetensors" and failing.total_updates == 300
     assert dispersed("--embed-dim=8").checkpoint is None
     assert re.match("--embed-dim 8: .*results/rocket_cutoff.* begins anew", capsys.readouterr().out)
     assert dispersed("--recipe=paper").checkpoint is None
@@ -814,12 +816,14 @@ def test_ctrl_c_and_resume(uninterrupted, fresh_folder, monkeypatch, capsys):
 
 
 @pytest.mark.slow
-def test_a_dispersed_rocket_is_resumed_bit_for_bit(fresh_folder, monkeypatch):
+@pytest.mark.parametrize("failing", [[], ["--failure=0.2", "--eval-starts=4"]], ids=["healthy", "failing"])
+def test_a_dispersed_rocket_is_resumed_bit_for_bit(fresh_folder, monkeypatch, failing):
     """With what only it has: the nominal flight, in both networks, and each environment's own vehicle."""
     rocket, argv = importlib.import_module("ppo_gtrxl_rocket"), ["--env-id=TwoStageLEO-v0", "--total-updates=3"]
     fresh_folder("nominal")
     rocket.main([*TINY, *argv, "--total-updates=1"])
     argv += [f"--checkpoint={run_folder().resolve() / 'agent.safetensors'}", "--dispersion=1", "--eval-every=0"]
+    argv += failing
     fresh_folder("whole")
     rocket.main([*TINY, *argv])
     whole = state_of(run_folder())
@@ -830,6 +834,8 @@ def test_a_dispersed_rocket_is_resumed_bit_for_bit(fresh_folder, monkeypatch):
     rocket.main([f"--resume={run_folder()}"])
     assert_same_bits(state_of(run_folder()), whole)
     assert whole["agent"]["nominal_flight"].any() and whole["average"]["module.nominal_flight"].any()
+    sizes = rocket.WIDE_DIFFERENCES if failing else rocket.DIFFERENCES
+    assert whole["average"]["module.differences"].tolist() == torch.tensor(sizes).tolist()
 
 
 def test_resume_after_a_crash(uninterrupted, fresh_folder, monkeypatch):
