@@ -816,7 +816,7 @@ def test_ctrl_c_and_resume(uninterrupted, fresh_folder, monkeypatch, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("failing", [[], ["--failure=0.2", "--eval-starts=4"]], ids=["healthy", "failing"])
+@pytest.mark.parametrize("failing", [[], ["--failure=0.2", "--eval-starts=10"]], ids=["healthy", "failing"])
 def test_a_dispersed_rocket_is_resumed_bit_for_bit(fresh_folder, monkeypatch, failing):
     """With what only it has: the nominal flight, in both networks, and each environment's own vehicle."""
     rocket, argv = importlib.import_module("ppo_gtrxl_rocket"), ["--env-id=TwoStageLEO-v0", "--total-updates=3"]
