@@ -157,14 +157,13 @@ DISPERSED = {  # replaces more, and goes on with a policy of the nominal flight
     "mass_weight": "0.1:0 0.2:0.2 0.5:0.2 0.85:0",
     "weight_average": 0.998,
 }
-FAILING = {**DISPERSED, "total_updates": 300}  # failures are many kinds of flights, and large ones are rare
 RECIPES = {"RocketAscent-v0": FIXED, "RocketAscentCutoff-v0": CUTOFF, "TwoStageLEO-v0": CUTOFF}
 FIRST_POLICY = {  # the policy with which a dispersed training begins, by environment id
     "RocketAscent-v0": "results/rocket_fixed/agent.safetensors",
     "RocketAscentCutoff-v0": "results/rocket_cutoff/agent.safetensors",
     "TwoStageLEO-v0": "results/two_stage_leo/agent.safetensors",
 }
-FIRST_OF_FAILING = {"RocketAscentCutoff-v0": "results/rocket_dispersed/agent.safetensors"}  # with failures it wins
+FIRST_OF_FAILING = {"RocketAscentCutoff-v0": "results/rocket_dispersed/agent.safetensors"}  # the same, with failures
 
 
 def has_draws(args):
@@ -185,7 +184,7 @@ def recipe(args):
         todo = f"train without {flag} first, and name that policy by --checkpoint"
         print(f"{flag}: no policy of {args.env_id} to begin with, so this training begins anew; better {todo}")
         return {**changes, "num_envs": DISPERSED["num_envs"], "flights_per_start": DISPERSED["flights_per_start"]}
-    return {**changes, **(FAILING if args.failure else DISPERSED), "checkpoint": first_policy}
+    return {**changes, **DISPERSED, "checkpoint": first_policy}
 
 
 # Problem: input and action (features, frame and first action are ours) ------------------------------------------------

@@ -161,7 +161,7 @@ def two_machines(folders, program, *argv, rendezvous):
     return agents
 
 
-def ends_of(agents, timeout=120):
+def ends_of(agents, timeout=300):
     """Exit statuses and outputs of both agents."""
     outputs = [agent.communicate(timeout=timeout)[0] for agent in agents]
     return [agent.returncode for agent in agents], outputs

@@ -218,7 +218,7 @@ def test_a_dispersed_training_begins_with_the_shipped_policy(monkeypatch, capsys
     args = dispersed()
     assert args.checkpoint == "results/rocket_cutoff/agent.safetensors" and args.log_std == "0:-3.5 1:-6.5"
     failing = dispersed("--failure=0.25")
-    assert failing.checkpoint == "results/rocket_dispersed/agent.safetensors" and failing.total_updates == 300
+    assert failing.checkpoint == "results/rocket_dispersed/agent.safetensors" and failing.total_updates == 150
     assert dispersed("--embed-dim=8").checkpoint is None
     assert re.match("--embed-dim 8: .*results/rocket_cutoff.* begins anew", capsys.readouterr().out)
     assert dispersed("--recipe=paper").checkpoint is None
