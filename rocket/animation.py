@@ -10,22 +10,29 @@ from matplotlib.transforms import Affine2D
 
 from drawing.animation import DOT, LOOKS, SIDES, Animation, Flight, Sheet, room
 from drawing.style import BOUNDARY, OPTIMUM, POLICY, TARGET
+from rocket.dispersion import Vehicles
 from rocket.orbits import orbit_vectors, orbital_elements, target_axes
-from rocket.vehicle import Rocket
+from rocket.vehicle import Rocket, engine_groups
 
 # nose at +x, one long; the flame behind it
 BODY = Outline([(1.0, 0.0), (0.45, 0.24), (-0.6, 0.24), (-0.6, -0.24), (0.45, -0.24), (1.0, 0.0)])
 FLAME = Outline([(-0.6, 0.2), (-1.6, 0.0), (-0.6, -0.2), (-0.6, 0.2)])
-EARTH = "#d7e6f2"
+EARTH, FAILURE = "#d7e6f2", "crimson"
 ALTITUDE, DOWNRANGE = 60.0, 600.0  # km: what the axes of a flight that has just begun show
 
 
 class AscentSheet(Sheet):
     """A rocket's ascent in the target's plane with its stagings, its pitch, and the orbit that it would coast on."""
 
-    def __init__(self, rocket: Rocket, title: str = "Rocket ascent", compared: bool = False):
+    def __init__(
+        self, rocket: Rocket, title: str = "Rocket ascent", compared: bool = False, vehicle: Vehicles | None = None
+    ):
+        """`vehicle`: the one that was drawn for the flight, whose stagings and failure are shown."""
         super().__init__(title)
         self.rocket, self.axes = rocket, target_axes(rocket)
+        self.stagings = stagings(rocket, vehicle)
+        self.burn_out = rocket.burns[-1].end if vehicle is None else vehicle.burn_end[-1, 0]  # s
+        self.strike = None if vehicle is None else loss_of_thrust(rocket, vehicle)
         self.styles = [{**POLICY, "linewidth": 2.0}, {**OPTIMUM, "linewidth": 1.3}][: 2 if compared else 1]
         self.ascent = self.panel((0.07, 0.47, 0.545, 0.45), ylabel="altitude (km)", xlabel="downrange (km)")
         self.pitch = self.panel((0.07, 0.105, 0.545, 0.235), ylabel="pitch (deg)", xlabel="time (s)")
@@ -39,6 +46,7 @@ class AscentSheet(Sheet):
         self._prepare_readings()
         self.moving = [*self.paths, *self.pitches, *self.orbits, *self.dots, self.flame, self.body, self.marks]
         self.moving += [*self.labels, self.clock, *self.readings]
+        self.moving += [self.failed, self.cross] if self.strike else []
 
     def _draw_orbit_panel(self):
         """The target's plane to scale, perigee to the right: Earth and the target orbit."""
@@ -83,19 +91,20 @@ class AscentSheet(Sheet):
         self.body = self.ascent.plot([], [], color=POLICY["color"], markersize=17, **edge, **look)[0]
 
     def _prepare_events(self):
-        """What is dropped at the end of each burn, unseen until it happens; the last is the end of the flight."""
-        self.events = []
-        for burn, dropped in zip(self.rocket.burns[:-1], self.rocket.jettison):
-            number = sum(n for n, _ in burn.dropped)
-            engines = f"{number} engine{'s' * (number != 1)}, " if number else ""
-            self.events.append((burn.end, f"{burn.end:.0f} s: {engines}{dropped / 1e3:.1f} t dropped"))
-        for time, _ in self.events:
+        """What is dropped at the end of each burn and what fails, unseen until it happens; the end of the flight."""
+        for time, _ in self.stagings:
             self.pitch.axvline(time, **BOUNDARY)
         self.marks = self.ascent.plot([], [], "o", color="k", markersize=4, zorder=8)[0]
         style = {"textcoords": "offset points", "fontsize": 8, "va": "center", "zorder": 8}
         style["bbox"] = {"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 1}
-        self.labels = [self.ascent.annotate("", (0, 0), (9, -3), **style) for _ in self.events]
+        self.labels = [self.ascent.annotate("", (0, 0), (9, -3), **style) for _ in self.stagings]
         self.labels.append(self.ascent.annotate("", (0, 0), (6, -18), ha="right", **style))  # inside, at the far end
+        if self.strike:
+            time, text = self.strike
+            self.pitch.axvline(time, **{**BOUNDARY, "color": FAILURE})
+            side = "left" if time <= self.rocket.end_time / 2 else "right"  # towards the middle: inside the panel
+            self.failed = self.pitch.text(time, 78, f" {text} ", ha=side, color=FAILURE, fontsize=8, weight="bold")
+            self.cross = self.ascent.plot([], [], "X", color=FAILURE, markersize=8, zorder=9)[0]
 
     def _prepare_readings(self):
         """Below the orbit: the clock, and of each side altitude, speed, mass, perigee and apogee."""
@@ -139,6 +148,7 @@ class AscentSheet(Sheet):
         top, right = room(ALTITUDE, 1.1 * altitude), room(DOWNRANGE, 1.03 * x)
         pitch = np.concatenate([pitch_above_horizon(flight) for flight in flights])
         self.pitch.set(ylim=(-room(10.0, 1.1 * np.minimum(pitch, 0.0)), 100))
+        self.pitch.set_xlim(0, max(self.rocket.end_time, *(flight.t[-1] for flight in flights)))
         self.ascent.set(xlim=(min(-0.03 * right, 1.03 * x.min()), right), ylim=(-0.06 * top, top))
 
     def show(self, *sides: list[Flight], ended: bool = False):
@@ -155,7 +165,7 @@ class AscentSheet(Sheet):
             reading.set_text(self._reading(flight.y[-1]))
         self._show_rocket(flights[0], ended)
         self._show_events(flights[0], ended)
-        running = min(sum(flights[0].t[-1] >= time for time, _ in self.events) + 1, len(self.rocket.burns))
+        running = min(sum(flights[0].t[-1] >= time for time, _ in self.stagings) + 1, len(self.rocket.burns))
         self.clock.set_text(f"t = {flights[0].t[-1]:.0f} s\nphase {running} of {len(self.rocket.burns)}")
 
     def _reading(self, y: np.ndarray) -> str:
@@ -177,18 +187,50 @@ class AscentSheet(Sheet):
 
     def _show_events(self, flight: Flight, ended: bool):
         x, altitude = self._track(flight.y)
-        happened = [(time, text) for time, text in self.events if time <= flight.t[-1]]
+        happened = [(time, text) for time, text in self.stagings if time <= flight.t[-1]]
         if ended:
-            how = "cut-off" if flight.t[-1] < self.rocket.burns[-1].end - 1e-6 else "end of the last burn"
+            how = "cut-off" if flight.t[-1] < self.burn_out - 1e-6 else "end of the last burn"
             happened.append((flight.t[-1], f"{flight.t[-1]:.0f} s: {'crash' if altitude[-1] < 0 else how}"))
         times = [time for time, _ in happened]
         spots = np.interp(times, flight.t, x), np.interp(times, flight.t, altitude)
-        self.marks.set_data(*(values[: len(self.events)] for values in spots))
+        self.marks.set_data(*(values[: len(self.stagings)] for values in spots))
         for k, label in enumerate(self.labels):
             label.set_visible(k < len(happened))
             if k < len(happened):
                 label.xy = spots[0][k], spots[1][k]
                 label.set_text(happened[k][1])
+        if self.strike:
+            self._show_failure(flight.t, x, altitude)
+
+    def _show_failure(self, t, x, altitude):
+        time, _ = self.strike
+        for artist in (self.failed, self.cross):
+            artist.set_visible(time <= t[-1])
+        self.cross.set_data([np.interp(time, t, x)], [np.interp(time, t, altitude)])
+
+
+def stagings(rocket: Rocket, vehicle: Vehicles | None) -> list[tuple[float, str]]:
+    """When the burns end, the last excepted, and what is dropped then; of a drawn vehicle or of the nominal one."""
+    if vehicle is None:
+        ends, dropped = [burn.end for burn in rocket.burns], rocket.jettison
+    else:
+        ends = vehicle.burn_end[:, 0]
+        dropped = [vehicle.dropped[vehicle.burn[:, 0] == k, 0].sum() for k in range(len(ends))]
+    told = []
+    for burn, end, mass in zip(rocket.burns[:-1], ends, dropped):
+        number = sum(n for n, _ in burn.dropped)
+        engines = f"{number} engine{'s' * (number != 1)}, " if number else ""
+        told.append((end, f"{end:.0f} s: {engines}{mass / 1e3:.1f} t dropped"))
+    return told
+
+
+def loss_of_thrust(rocket: Rocket, vehicle: Vehicles) -> tuple[float, str] | None:
+    """When the failure of a drawn vehicle strikes, and what it takes; None of a healthy one."""
+    group, time, share = vehicle.failure[:, 0]
+    if group < 0:
+        return None
+    number = engine_groups(rocket)[int(group)].number
+    return time, f"{time:.0f} s: {number} engine{'s' * (number != 1)} lose{'s' * (number == 1)} {share:.0%} of thrust"
 
 
 def pitch_above_horizon(flight: Flight) -> np.ndarray:
@@ -207,3 +249,10 @@ def ascent_animation(rocket: Rocket, arrays: dict, title: str) -> Animation:
     for suffix, name in SIDES.items():
         sides.append([Flight.of(*(arrays[f"{key}{suffix}"] for key in ("t", "u", "y")), name)])
     return Animation.of(AscentSheet(rocket, title, compared=True), sides, HASTE)
+
+
+def failure_animation(rocket: Rocket, vehicle: Vehicles, arrays: dict, title: str) -> Animation:
+    """The saved flight of an evaluation that a failure made burn longest, beside the nominal flight's optimum."""
+    policy = Flight.of(*(arrays[f"{key}_saved"] for key in ("t", "u", "y")), "saved")
+    optimum = Flight.of(*(arrays[f"{key}_reference"] for key in ("t", "u", "y")), "optimum")
+    return Animation.of(AscentSheet(rocket, title, compared=True, vehicle=vehicle), [[policy], [optimum]], HASTE)

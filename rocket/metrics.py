@@ -193,16 +193,24 @@ def dispersed_metrics(flights: dict, rocket: Rocket) -> dict:
     return {key: float(value) for key, value in metrics.items() if np.isfinite(value)} | counts
 
 
-def failure_metrics(arrays: dict, best_mass: np.ndarray, mass_reached: np.ndarray, dry_mass: np.ndarray) -> dict:
-    """The statistics of the flights with a failure, of n flights as `evaluate_dispersed` returns their arrays.
+def savable_flights(arrays: dict, best_mass: np.ndarray, dry_mass: np.ndarray) -> np.ndarray:
+    """The flights (n,) that lose thrust and could yet reach their orbit.
 
     best_mass (n,) kg: what the optimum has left in the target orbit that knows of the failure from its strike on, its
     dry mass relaxed (`rescue.py`; NaN where none was found). A flight is savable where that is above dry_mass (n,) kg.
-    Errors and the rate are of the savable flights. The mass that is short is that of the saved flights, beside
-    mass_reached (n,) kg, what the same optimum has left in the orbit that the flight reached.
+    """
+    return ~healthy(arrays) & (best_mass > dry_mass)
+
+
+def failure_metrics(arrays: dict, best_mass: np.ndarray, mass_reached: np.ndarray, dry_mass: np.ndarray) -> dict:
+    """The statistics of the flights with a failure, of n flights as `evaluate_dispersed` returns their arrays.
+
+    best_mass and dry_mass (n,) kg: see `savable_flights`. Errors and the rate are of the savable flights. The mass that
+    is short is that of the saved flights, beside mass_reached (n,) kg, what the same optimum has left in the orbit that
+    the flight reached.
     """
     has_failed = ~healthy(arrays)
-    savable = has_failed & (best_mass > dry_mass)
+    savable = savable_flights(arrays, best_mass, dry_mass)
     errors = np.linalg.norm(arrays["final_error"], axis=1)
     saved = savable & (errors < SUCCESS)
     counts = {"failure_starts": int(has_failed.sum()), "failure_savable": int(savable.sum())}

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import partial
 
+import numpy as np
+
 from common.command_line import integer, number
 from common.errors import BadInput, refuse_unless
 from common.tasks import Interface
@@ -28,6 +30,7 @@ from rocket.metrics import (
     lowest_key,
     perigee_longitude,
     rocket_metrics,
+    savable_flights,
 )
 from rocket.missions import ROCKETS, Mission
 from rocket.navigation import ALLOWED, NOMINAL_FLIGHT, flight_noise, is_noise, noise_metrics
@@ -104,7 +107,9 @@ class RocketTask:
             of_healthy, ends = evaluate_dispersed(self.env_id, policy, eval_seed, n, **failing._asdict(), **env_options)
             metrics, arrays = metrics | of_healthy, arrays | ends
             if failure:
-                metrics |= self.flown_with(**env_options).failures_measured(ends, failing, eval_seed)
+                task = self.flown_with(**env_options)
+                metrics |= task.failures_measured(ends, failing, eval_seed)
+                arrays |= task.saved_flight(policy, ends, failing, eval_seed, **env_options)
         return metrics, arrays
 
     def failures_measured(self, arrays: dict, failing: Failing, eval_seed: int) -> dict:
@@ -115,6 +120,23 @@ class RocketTask:
         dry_mass = draw_vehicles(rocket, failing.dispersion, arrays["draw"]).dry_mass
         options = {"failure": float(failing.failure), "failure_time": failing.failure_time}
         return options | failure_metrics(arrays, known.mass, reached, dry_mass)
+
+    def saved_flight(self, policy, arrays: dict, failing: Failing, eval_seed: int, **env_options) -> dict:
+        """Of the saved flights the one that a failure made burn longest, flown again for the animation.
+
+        Returns `t_saved` (K+1,), `u_saved` (K, 3), `y_saved` (K+1, 7) and `saved`, its number; {} where none is saved.
+        """
+        known = known_optima(self.env_id, self.mission, failing, eval_seed, len(arrays["draw"]))
+        vehicles = draw_vehicles(self.mission.rocket, failing.dispersion, arrays["draw"])
+        errors = np.linalg.norm(arrays["final_error"], axis=1)
+        saved = savable_flights(arrays, known.mass, vehicles.dry_mass) & (errors < SUCCESS)
+        if not saved.any():
+            return {}
+        k = int(np.where(saved, arrays["final_t"], 0.0).argmax())
+        noise = partial(flight_noise, eval_seed, [k])
+        options = {**failing._asdict(), **env_options}
+        flight = fly_rocket(self.env_id, policy, draw=arrays["draw"][k], noise=noise, **options)
+        return {f"{key}_saved": flight[key] for key in ("t", "u", "y")} | {"saved": np.array(k)}
 
     def reported_metrics(self, metrics: dict, timed_policy=None, **env_options) -> dict:
         """The mass beside the optimum's for the orbit that was reached; of flights that differ a decision's time."""
@@ -233,9 +255,15 @@ class RocketTask:
         return training_figure(curves, self.headline(metrics), metrics["reference_episodic_return"], miss)
 
     def animation(self, arrays: dict, metrics: dict):
-        from rocket.animation import ascent_animation
+        from rocket.animation import ascent_animation, failure_animation
 
-        return ascent_animation(self.mission.rocket, arrays, self.headline(metrics))
+        if "saved" not in arrays:
+            return ascent_animation(self.mission.rocket, arrays, self.headline(metrics))
+        draw, options = arrays["draw"][arrays["saved"]][None], (metrics["failure"], metrics["failure_time"])
+        vehicle = draw_vehicles(self.mission.rocket, metrics.get("dispersion", 0.0), draw, *options)
+        error = np.linalg.norm(arrays["final_error"][arrays["saved"]])
+        title = f"{self.env_id}: a flight that loses thrust, ||error|| {error:.6f}, and the optimum without a loss"
+        return failure_animation(self.mission.rocket, vehicle, arrays, title)
 
     # --- files
 

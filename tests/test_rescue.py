@@ -329,6 +329,29 @@ def test_no_flight_ends_heavier_than_the_optimum_that_knows(flown):
 
 
 @pytest.mark.slow
+def test_the_saved_flight_that_burns_longest_is_kept(flown):
+    """Flown alone it ends as it did among the others; the animation marks what it lost and its own stagings."""
+    _, metrics, arrays = flown
+    errors = np.linalg.norm(arrays["final_error"], axis=1)
+    known = rescue.known_optima(CUTOFF, ROCKETS[CUTOFF], PROTOCOL, 7, FLIGHTS)
+    vehicles = envs.draw_vehicles(ROCKET, 1.0, arrays["draw"], 0.3)
+    saved = (known.mass > vehicles.dry_mass) & (errors < 0.02) & (arrays["failure"][:, 0] >= 0)
+    k = int(arrays["saved"])
+    assert saved[k] and arrays["t_saved"][-1] == arrays["final_t"][k] == arrays["final_t"][saved].max()
+    np.testing.assert_allclose(arrays["y_saved"][-1, :6], arrays["final_y"][k, :6], rtol=1e-9)
+
+    animation = task_of(CUTOFF).animation(arrays, metrics)
+    animation.frame(len(animation.times) - 1)
+    ends = [float(label.get_text().split()[0]) for label in animation.sheet.labels[:3]]
+    assert ends == [round(end) for end in vehicles.burn_end[:3, k]] and animation.sheet.cross.get_visible()
+    _, moment, share = arrays["failure"][k]
+    text = animation.sheet.failed.get_text()
+    assert text.strip().startswith(f"{moment:.0f} s: ") and f" {share:.0%} of thrust" in text
+    animation.frame(0)
+    assert not animation.sheet.cross.get_visible() and not animation.sheet.failed.get_visible()
+
+
+@pytest.mark.slow
 def test_table_figure_and_rows(flown, tmp_path):
     _, metrics, arrays = flown
     table = table_of(metrics)
@@ -403,7 +426,7 @@ def test_a_training_with_failures(no_solves, tmp_path, monkeypatch):
 
 def test_a_training_with_failures_begins_as_a_dispersed_one():
     args = parse(f"--env-id={CUTOFF}", "--failure=0.2")
-    assert args.checkpoint.endswith("results/rocket_cutoff/agent.safetensors") and args.flights_per_start == 16
+    assert args.checkpoint.endswith("results/rocket_dispersed/agent.safetensors") and args.flights_per_start == 16
     assert args.eval_starts == 1705 and args.dispersion == 0.0
 
 
