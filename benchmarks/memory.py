@@ -4,6 +4,7 @@
     python benchmarks/run_seeds.py benchmarks/memory_nominal_jobs.txt --at-once 2           # the same: hours
     python benchmarks/run_seeds.py benchmarks/memory_rocket_jobs.txt --at-once 2 --numbers  # the same: hours
     python benchmarks/run_seeds.py benchmarks/memory_failures_jobs.txt --at-once 2 --numbers  # the same: an hour
+    python benchmarks/run_seeds.py benchmarks/memory_navigation_jobs.txt --at-once 2 --numbers  # the same: an hour
     python benchmarks/run_seeds.py benchmarks/memory_lander_jobs.txt --at-once 2 --numbers  # the same: hours
     python benchmarks/memory.py                                                             # prints, draws: seconds
     python benchmarks/memory.py --by-seed                                                   # a line for each run
@@ -149,6 +150,12 @@ EXPERIMENTS = {
         "Dispersed rocket with a loss of thrust at a random moment: share of the savable flights that are saved",
         {**lengths(0, 1), "../../rocket_failures": "L_mem 32", "mlp": "MLP of about the same size"},
         FAILED,
+        drawn=False,
+    ),
+    "navigation": Experiment(
+        "Dispersed rocket, position and velocity seen with noise of 10 m and 0.1 m/s: ||error|| over 1705 flights",
+        lengths(0, 32),
+        DISPERSED,
         drawn=False,
     ),
     "lander": Experiment(

@@ -242,6 +242,18 @@ def test_rows_with_failures_are_the_shipped_command_but_for_what_they_say(tmp_pa
         assert different == CHANGED[job.results.name], shlex.join(job.command)
 
 
+def test_rows_with_noise_are_the_shipped_command_but_for_what_they_say(tmp_path, monkeypatch):
+    monkeypatch.chdir(ROOT)
+    (shipped, *_) = (j.args for j in rocket_jobs(tmp_path, "result_jobs.txt") if j.results.name == "rocket_dispersed")
+    name = "memory_navigation_jobs.txt"
+    without, own = rocket_jobs(tmp_path, name, begun=["memory_0"], policies="rocket", seeds=1)
+    for job, expected in ((without, CHANGED["memory_0"]), (own, {})):
+        different = {name: value for name, value in job.args.items() if value != shipped[name]}
+        different.pop("checkpoint", None)
+        assert different == expected | {"navigation_noise": [10.0, 0.1]}, shlex.join(job.command)
+    assert own.args["checkpoint"] == "results/rocket_dispersed/agent.safetensors"
+
+
 def test_one_phase_is_flown_by_the_shipped_command_without_memory():
     """L_mem 32 is the front page's result here, too."""
     shipped = run_seeds.read_jobs(ROOT / "benchmarks" / "result_jobs.txt")
