@@ -26,7 +26,7 @@ from memory import cell  # noqa: E402
 from common.command_line import OneLineParser, integer  # noqa: E402
 
 FOLDER = ROOT / "results" / "peers"
-LOW_PRICE = "--mass-weight 0.3"  # of the propellant: to the one that ours had, which rose to 3, it loses the orbit
+LOW_PRICE = "--mass-weight 0.3"  # of the propellant: under the full one, which rises to 3, it loses the orbit
 CUTOFF = f"--env-id RocketAscentCutoff-v0 --batch-size 512 --learning-rate 1e-3 --samples 7450000 {LOW_PRICE}"
 LSTM = "--env-id RocketAscentCutoff-v0 --recurrent --batch-size 3848 --epochs 6 --learning-rate 1e-3 --samples 3700000"
 DI_KEYS = {"ratio_of_sums": "ratio of sums", "ratio_p95": "p95", "hit_rate": "hits"}
@@ -49,8 +49,8 @@ class Peer:
 
 
 PEERS = {
-    "cutoff": Peer("cut-off, our former price", f"{CUTOFF} --mass-weight 3", ROCKET_KEYS),
-    "cutoff_low_price": Peer("cut-off, a tenth of it", CUTOFF, ROCKET_KEYS),
+    "cutoff": Peer("cut-off, propellant at full price", f"{CUTOFF} --mass-weight 3", ROCKET_KEYS),
+    "cutoff_low_price": Peer("cut-off, a tenth of that price", CUTOFF, ROCKET_KEYS),
     "cutoff_raw": Peer("cut-off, a tenth, raw observations", f"{CUTOFF} --features raw", ROCKET_KEYS),
     "cutoff_longer": Peer("cut-off, a tenth, twice the samples", f"{CUTOFF} --samples 14900000", ROCKET_KEYS),
     "lstm": Peer("LSTM, cut-off, a tenth", f"{LSTM} {LOW_PRICE}", ROCKET_KEYS, (1,)),
