@@ -113,7 +113,7 @@ class Args:
     weight_average: float = 0.0  # decay, per optimiser step, of the averaged weights used in evaluation
 
 
-# Recipes: the values that we replace (beside Table 1's: docs/decisions.md; trials: docs/training-notes.md) ------------
+# Recipes: the values that we replace (beside Table 1's: docs/decisions.md; why: docs/method.md) -----------------------
 OURS = {
     "num_blocks": 2,  # a laptop's network, a hundredth of Table 1's weights
     "embed_dim": 64,
@@ -818,7 +818,7 @@ def linear_fit(x, y, alive):
     So its residual is smaller by the factor 1 - leverage, and an episode in an extreme state counts less. The leverage
     depends on the states of this step and not on the action. So with --gae-lambda 1 the expected policy gradient of a
     state keeps its direction; below 1 this holds only approximately. Fits that leave the episode out were worse:
-    docs/training-notes.md.
+    docs/archive.md.
     """
     x, y = x.double(), y.double()[..., None]
     weight = alive.double()[..., None]  # (..., G, 1)

@@ -6,8 +6,11 @@
     python benchmarks/run_seeds.py benchmarks/memory_failures_jobs.txt --at-once 2 --numbers  # the same: an hour
     python benchmarks/run_seeds.py benchmarks/memory_navigation_jobs.txt --at-once 2 --numbers  # the same: an hour
     python benchmarks/run_seeds.py benchmarks/memory_lander_jobs.txt --at-once 2 --numbers  # the same: hours
+    python benchmarks/run_seeds.py benchmarks/ablation_jobs.txt --at-once 2 --numbers       # the same: two hours
     python benchmarks/memory.py                                                             # prints, draws: seconds
     python benchmarks/memory.py --by-seed                                                   # a line for each run
+
+The ablation is not of the memory: it shows what each addition to PPO brings (docs/method.md).
 
 Each row is one way of learning, each figure the median over its seeds with the range of all. Rows without a finished
 run are left out. Beside the hidden velocity stands the expected cost that no memory can beat.
@@ -36,7 +39,7 @@ from drawing.style import save_figures  # noqa: E402
 
 @dataclass
 class Experiment:
-    """Runs that differ by their memory alone: what is asked, and the keys of eval.json that answer."""
+    """Runs that differ by one thing alone: what is asked, and the keys of eval.json that answer."""
 
     title: str
     rows: dict[str, str]  # folder, seen from results/memory/<experiment> -> what is printed of it
@@ -133,6 +136,29 @@ EXPERIMENTS = {
         "Double integrator, nothing hidden, by the command of results/di",
         {"memory_0": "L_mem 0", "../../di": "L_mem 32"},
         {"ratio_of_sums": "ratio of sums", "ratio_mean": "mean ratio", "ratio_p95": "p95"},
+        drawn=False,
+    ),
+    "../ablation": Experiment(
+        "Double integrator, the command of results/di with one addition off",
+        {
+            "../di": "all additions",
+            "noise_learned": "noise learned",
+            "rate_constant": "learning rate constant",
+            "rate_linear": "learning rate falls linearly",
+            "no_groups": "flights not compared",
+            "memory_noise_stays": "noise of the memory stays",
+            "last_weights": "last weights, not averaged",
+            "no_kl_limit": "no KL limit",
+            "lambda_stays": "GAE lambda stays at 0.95",
+            "discounted": "gamma 0.99",
+            "rewards_unscaled": "rewards not scaled",
+        },
+        {
+            "ratio_of_sums": "ratio of sums",
+            "ratio_mean": "mean ratio",
+            "ratio_p95": "p95",
+            "hit_rate": "hit the circle",
+        },
         drawn=False,
     ),
     "nominal": Experiment(

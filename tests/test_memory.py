@@ -262,3 +262,38 @@ def test_one_phase_is_flown_by_the_shipped_command_without_memory():
     assert [job.args for job in jobs] == [args | {"memory_length": 0} for args in shipped[:3]]
     assert {job.results for job in jobs} == {Path("results/memory/one_phase/memory_0")}
     assert set(memory.EXPERIMENTS["one_phase"].rows) == {"memory_0", "../../di"}
+
+
+ADDITIONS = {
+    "noise_learned": {"log_std"},
+    "rate_constant": {"lr_times_std"},
+    "rate_linear": {"lr_times_std", "learning_rate"},
+    "no_groups": {"flights_per_start"},
+    "memory_noise_stays": {"memory_noise"},
+    "last_weights": {"weight_average"},
+    "no_kl_limit": {"target_kl"},
+    "lambda_stays": {"gae_lambda"},
+    "discounted": {"gamma"},
+    "rewards_unscaled": {"reward_scale"},
+}
+
+
+def test_the_ablation_is_the_shipped_command_with_one_addition_off():
+    """Three seeds of each row. What is off has the value of the paper's recipe, but for a rate that falls."""
+    shipped = run_seeds.read_jobs(ROOT / "benchmarks" / "result_jobs.txt")
+    shipped = {job.args["seed"]: job.args for job in shipped if job.results == Path("results/di")}
+    paper = vars(script.Args())
+    jobs = run_seeds.read_jobs(ROOT / "benchmarks" / "ablation_jobs.txt")
+    assert [job.args["seed"] for job in jobs] == [1, 2, 3] * len(ADDITIONS)
+    for row, changed in ADDITIONS.items():
+        mine = [job for job in jobs if job.results == Path(f"results/ablation/{row}")]
+        assert len(mine) == 3
+        for job in mine:
+            off = {name: value for name, value in job.args.items() if value != shipped[job.args["seed"]][name]}
+            assert set(off) == changed, shlex.join(job.command)
+            assert row == "rate_linear" or off == {name: paper[name] for name in changed}
+    assert set(memory.EXPERIMENTS["../ablation"].rows) == {"../di", *ADDITIONS}
+    (linear,) = {job.args["learning_rate"] for job in jobs if job.results.name == "rate_linear"}
+    found = [script.value_at(linear, progress) for progress in (0.0, 1.0)]
+    std = np.exp([script.value_at(shipped[1]["log_std"], progress) for progress in (0.0, 1.0)])
+    np.testing.assert_allclose(found, shipped[1]["learning_rate"] * std, rtol=0.02)  # the shipped rate's ends
