@@ -53,7 +53,22 @@ def test_a_policy_was_trained_by_the_command_that_its_list_gives(folder, monkeyp
     args = vars(script.Args()) | args  # a flag that came after the policy has its default
     differ = {name for name, value in job.args.items() if args[name] != value}
     assert differ <= {"exp_name", "eval_starts"}
-    assert on_gpu or set(job.command[1::2]) <= {"--env-id", "--dispersion", "--seed"}
+    assert on_gpu or set(job.command[1::2]) <= {"--env-id", "--dispersion", "--failure", "--seed"}
+
+
+def test_held_out_runs_are_the_results_commands_with_other_seeds(monkeypatch):
+    """Two a row, no seed twice; all are measured on the starts and draws of one seed that no result has."""
+    monkeypatch.chdir(ROOT)
+    shipped = {job.results.name: job.args for job in run_seeds.read_jobs("benchmarks/result_jobs.txt")}
+    held_out = run_seeds.read_jobs("benchmarks/held_out_jobs.txt")
+    assert sorted(job.results.name for job in held_out) == sorted(2 * list(shipped))
+    for job in held_out:
+        assert job.results.parent.name == "held_out"
+        differ = {name for name, value in job.args.items() if value != shipped[job.results.name][name]}
+        assert differ == {"seed", "eval_seed"}
+    (eval_seed,) = {job.args["eval_seed"] for job in held_out}
+    seeds = [job.args["seed"] for job in held_out]
+    assert len({*seeds, eval_seed, 0}) == len(seeds) + 2 and not {*seeds, eval_seed} & {1, 2, 3, 4, 5}
 
 
 def test_table_1_s_rocket_is_the_last_evaluation_of_its_curve():
