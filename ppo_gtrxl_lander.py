@@ -126,7 +126,7 @@ OURS = {
     "total_updates": 280,
     "num_envs": 1024,  # with fewer an update flights burn more
     "num_minibatches": 32,
-    "flights_per_start": "0:32 0.7:32 0.7001:16",  # more draws late: those that are hard to land are rare
+    "flights_per_start": 32,
     "update_epochs": 4,
     "learning_rate": 3e-3,
     "lr_times_std": True,
@@ -147,7 +147,7 @@ MARS = {
     **OURS,
     "thrust_share": 0.8,  # the rest is a reserve for failures that are worse than those of the training
     "start_spread": 1.25,  # so is this: less thrust sideways is as if the pad were farther and the start faster
-    "wind": 0.7,  # and this: a policy has to see its motion answer less than it expects
+    "wind": "0:0.7 0.8:0.7 1:0.2",  # and this: a policy has to see its motion answer less than it expects
     "longest_flight": 60.0,  # flights of learned policies take 45 s
 }
 ONE_START = {  # all flights of an update are compared
@@ -230,7 +230,7 @@ def set_curriculum(envs, args, progress):
     """
     if isinstance(args.log_std, str):
         std = math.exp(value_at(args.log_std, progress))
-        envs.position_scale = max(30 * std, POSITION_SCALE)
+        envs.position_scale = max(100 * std, POSITION_SCALE)
         envs.speed_scale = max(10 * std, SPEED_SCALE)
     envs.fuel_price = value_at(args.fuel_weight, progress)
     envs.slope_price = value_at(args.slope_weight, progress)
