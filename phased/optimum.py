@@ -187,7 +187,7 @@ class Sketch(NamedTuple):
 
 
 def lasting(times: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """The controls at the middle of the steps between `times`. Each of u (K, m) is held for 1 / K of the time 0 to 1."""
+    """The controls at mid-step between `times`. Each of u (K, m) is held for 1 / K of the time 0 to 1."""
     middle = (times[:-1] + times[1:]) / 2
     return u[np.minimum((middle * len(u)).astype(int), len(u) - 1)]
 
