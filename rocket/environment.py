@@ -336,7 +336,7 @@ class RocketVectorEnv(BatchedEnv):
         self._noise[mask, :observations] = noise[mask, :observations]
 
     def _scores(self, n):
-        """New draws (n, k). Groups have theirs in pairs, z and -z, so that the mean of a few draws is near zero."""
+        """New draws (n, k). Draws of groups come in pairs, z and -z, so that the mean of a few is near zero."""
         in_pairs = self.flights_per_start > 1
         if in_pairs:
             half = self.np_random.standard_normal((-(-n // 2), self._scores_drawn))
