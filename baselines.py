@@ -8,12 +8,13 @@
     python baselines.py Goddard-v0 --starts 1             # also those of problems/ and vehicles/
     python baselines.py rocket --json results/rocket_reference.json --npz results/rocket_reference.npz
 
-Each prints mean costs over random starts and what they are compared with; a rocket has one start. All optima are flown
-once more by the environments.
+Each command prints mean costs over random starts, and what they are compared with. A rocket has one start. The
+environments fly all optima once more.
+
 Reading order: the double integrator's bounded optimum, IPOPT from many starts, references, what they are compared with,
-command line. The methods are in `phased/lqr.py` and `phased/optimum.py`, the rockets' in `rocket/optimum.py`. CasADi
-and SciPy are imported only where they are used: in a training at its start, when it solves the optimum that its
-evaluations fly.
+command line. The methods are in `phased/lqr.py` and `phased/optimum.py`, the rockets' are in `rocket/optimum.py`.
+CasADi and SciPy are imported only where they are used. A training uses them at its start, when it solves the optimum
+that its evaluations fly.
 """
 
 from __future__ import annotations
@@ -46,11 +47,11 @@ __all__ = [  # what users import from here
     "starts",
 ]  # fmt: skip
 
-# relative difference between the cost of a program's solution and of its flight; an event is met to rounding alone
+# largest relative difference between the cost of a program's solution and that of its flight
 REPLAY_TOLERANCE = 1e-8
-REPLAY_TOLERANCE_OF_EVENTS = 1e-5
+REPLAY_TOLERANCE_OF_EVENTS = 1e-5  # larger, because an event is met only up to rounding
 NO_FLIGHT = "has no flight that reaches its circles and events within bounds and longest times, or none was found"
-STARTS_PER_PROCESS = 100  # fewer are solved sooner than another process has started
+STARTS_PER_PROCESS = 100  # fewer starts are solved sooner than another process starts
 
 # ---------------------------------------------------------------------------------------------------------------------
 # The double integrator's bounded optimum
@@ -58,19 +59,22 @@ STARTS_PER_PROCESS = 100  # fewer are solved sooner than another process has sta
 
 
 def box_qp(problem: Problem, x0):
-    """Optimal controls u (n, T) of the bounded double integrator from x0 (n, 2): the check of clipped LQR.
+    """Optimal controls u (n, T) of the bounded double integrator from x0 (n, 2), to check the clipped LQR.
 
-    All states are written as x = Phi x0 + Gamma u (the condensed form of model predictive control, e.g. Rawlings and
-    Mayne), which leaves least squares in u within |u| <= u_max: solved by SciPy's active-set method BVLS.
+    All states are written as x = Phi x0 + Gamma u, the condensed form of model predictive control (e.g. Rawlings and
+    Mayne). This leaves least squares in u within |u| <= u_max, which SciPy's active-set method BVLS solves.
     """
     from scipy.optimize import lsq_linear
 
-    (phase,), T = problem.phases, problem.steps
+    (phase,) = problem.phases
+    T = problem.steps
     A, B = linearise(problem)
-    Phi, Gamma = np.zeros((T + 1, 2, 2)), np.zeros((T + 1, 2, T))
+    Phi = np.zeros((T + 1, 2, 2))
+    Gamma = np.zeros((T + 1, 2, T))
     Phi[0] = np.eye(2)
     for t in range(T):
-        Phi[t + 1], Gamma[t + 1] = A @ Phi[t], A @ Gamma[t]
+        Phi[t + 1] = A @ Phi[t]
+        Gamma[t + 1] = A @ Gamma[t]
         Gamma[t + 1, :, t] = B[:, 0]
     weight = np.sqrt(np.vstack([np.tile(problem.state_weights(phase), (T, 1)), np.full((1, 2), phase.Qf)]))  # (T+1, 2)
     states = (weight[:, :, None] * Gamma).reshape(-1, T)
@@ -89,9 +93,10 @@ def box_qp(problem: Problem, x0):
 
 def _solve_start(job: Job):
     """Solve one start: control (T, m), the cost, whether there is a solution, and the circles' multipliers."""
-    problem, (best, exists) = PROBLEMS[job.env_id], best_solution(job)
+    problem = PROBLEMS[job.env_id]
+    best, exists = best_solution(job)
     u = best.unknowns[: problem.controls * sum(best.mesh.counts)].reshape(-1, problem.controls)
-    u = np.vstack([u, np.tile(u[-1], (problem.steps - len(u), 1))])  # held on behind an event
+    u = np.vstack([u, np.tile(u[-1], (problem.steps - len(u), 1))])  # the last control is held after an event
     return u, best.cost, exists, best.multipliers
 
 
@@ -103,19 +108,21 @@ def optimise(
     processes: int | None = None,
     draw=None,
 ):
-    """Solve `program` from each start x0 (n, states): controls u (n, T), or (n, T, m) where the table has a tuple of
-    them, costs (n,), whether a solution exists (n,), and the multipliers of the circles' constraints (n, circles), or
-    (n, 0) without `in_circles`. draw (n, k) are the standard scores.
+    """Solve `program` from each start x0 (n, states). draw (n, k) are the standard scores.
 
-    Of several `guesses` the best solution counts; one that fails is no error where another does not. Where no solution
-    exists (circles, bounds or an event out of reach) the rest are IPOPT's last ones and mean nothing. Any other failure
-    is a RuntimeError that names the start. Equal starts are solved once. `processes` (default: by the number of starts
-    and cores) changes only the time.
+    Returns the controls u (n, T), or (n, T, m) if the table has a tuple of controls, the costs (n,), whether a solution
+    exists (n,), and the multipliers of the circles' constraints (n, circles), or (n, 0) without `in_circles`.
+
+    The best solution of several `guesses` counts. A guess that fails is no error if another does not fail. Without any
+    solution (circles, bounds or an event out of reach) the other numbers are IPOPT's last ones and mean nothing. Raises
+    NoOptimum that names the start for any other failure. Equal starts are solved once. `processes` changes only the
+    time. Its default depends on the number of starts and cores.
     """
-    problem, x0 = PROBLEMS[env_id], np.asarray(x0, dtype=np.float64)
+    problem = PROBLEMS[env_id]
+    x0 = np.asarray(x0, dtype=np.float64)
     draw = np.zeros((len(x0), problem.scores)) if draw is None else np.asarray(draw, dtype=np.float64)
     _, first, of_start = np.unique(np.hstack([x0, draw]), axis=0, return_index=True, return_inverse=True)
-    order = np.argsort(first)  # as the starts are given: an error names the first
+    order = np.argsort(first)  # in the order of the starts, so that an error names the first one
     rank = np.argsort(order)
     jobs = [Job(env_id, defect, in_circles, int(k), x0[k], draw[k]) for k in first[order]]
     if processes is None:
@@ -137,11 +144,11 @@ def optimise(
 def fly_solution(env_id: str, x0, u, cost, draw=None):
     """Fly the controls u (n, T) from x0 (n, 2): what `envs.fly` returns, and `replay_error` (n,).
 
-    That is the relative difference between the program's `cost` (n,) and the flight's. Raises RuntimeError, naming the
-    start, above `REPLAY_TOLERANCE`: then the program is not the environment's problem.
+    The replay error is the relative difference between the program's `cost` (n,) and the flight's. Above
+    `REPLAY_TOLERANCE` the program is not the environment's problem. Then NoOptimum is raised, which names the start.
     """
     flight = fly(env_id, lambda obs, t: u[:, t].reshape(len(u), -1), x0, draw)
-    # a cost below 1e-4 (a start within 0.003 of the origin) is compared absolutely: IPOPT has a tolerance too
+    # a cost below 1e-4 (a start within 0.003 of the origin) is compared absolutely, because of IPOPT's own tolerance
     error = np.abs(cost - flight["cost"]) / np.maximum(np.abs(flight["cost"]), 1e-4)
     worst = int(np.argmax(error))
     tolerance = REPLAY_TOLERANCE_OF_EVENTS if PROBLEMS[env_id].has_events else REPLAY_TOLERANCE
@@ -154,14 +161,17 @@ def fly_solution(env_id: str, x0, u, cost, draw=None):
 
 
 def reference(env_id: str, x0, processes: int | None = None, draw=None) -> dict:
-    """The optimum from each start x0 (n, states), flown by the environment: `envs.fly`'s arrays, from these methods.
+    """The optimum from each start x0 (n, states), flown by the environment: the arrays of `envs.fly`.
 
-    draw (n, k) are the standard scores of a table that has some; the optimum knows the hidden parameters.
+    draw (n, k) are the standard scores, if the table has any. The optimum knows the hidden parameters. The method is
 
-    DoubleIntegrator-v0: LQR clipped at the bound, which is the bounded optimum from the start box (`box_qp` agrees).
-    Other costs by weights with one phase: multiple shooting, with `replay_error` (n,). With several phases: see
-    `waypoint_reference`; with costs by functions, `reference_in_circles`.
-    Raises ValueError on an unknown id, a bad x0 or number of processes, RuntimeError where a solve or replay fails.
+    - for DoubleIntegrator-v0, LQR clipped at the bound, which is the bounded optimum from the start box (`box_qp`
+      agrees)
+    - for other costs by weights with one phase, multiple shooting, which adds `replay_error` (n,)
+    - for costs by weights with several phases, `waypoint_reference`
+    - for costs by functions with circles, `reference_in_circles`
+
+    Raises ValueError for an unknown id, a bad x0 or number of processes, and NoOptimum if a solve or replay fails.
     """
     x0 = np.asarray(x0, dtype=np.float64)
     if env_id not in PROBLEMS:
@@ -184,9 +194,9 @@ def reference(env_id: str, x0, processes: int | None = None, draw=None) -> dict:
 
 
 def reference_in_circles(env_id: str, x0, processes: int | None = None, draw=None) -> dict:
-    """The optimum that ends each phase in its circle. Raises RuntimeError where it does not exist, or misses in flight.
+    """The optimum that ends each phase in its circle. Raises NoOptimum if there is none, or if its flight misses.
 
-    A bonus is what tells a learner of the circles: it has to be more than what reaching them costs.
+    A learner learns of the circles only by the bonus. So the bonus has to be more than the cost of reaching them.
     """
     u, cost, feasible, _ = optimise(env_id, x0, in_circles=True, processes=processes, draw=draw)
     refuse_first(~feasible, env_id, x0, NO_FLIGHT)
@@ -196,20 +206,24 @@ def reference_in_circles(env_id: str, x0, processes: int | None = None, draw=Non
 
 
 def refuse_first(bad: np.ndarray, env_id: str, x0, what: str):
-    """NoOptimum that names the first bad start (n,), if there is one."""
+    """Raise NoOptimum that names the first bad start of the mask (n,), if there is one."""
     if bad.any():
         start = int(np.argmax(bad))
         raise NoOptimum(f"start {start}, x0 = {x0[start].tolist()}, of {env_id} {what}")
 
 
 def waypoint_reference(env_id: str, x0, processes: int | None = None, draw=None) -> dict:
-    """The better, bonuses counted, of the optima with and without |x - target| <= r at every phase's end.
+    """The better of two optima, with and without the constraints |x - target| <= r at every phase's end.
 
-    Beside `fly_solution`'s arrays: `constrained` (n,), whether it is the one with the circles; `infeasible` (n,),
-    whether no control reaches all circles (then it is the one without); `cost_free` (n,), `terminal_error_free`
-    (n, phases) of the optimum without; `circle_price` (n, phases), what a unit of radius would save the one with the
-    circles: from their multipliers, 0 where it ends inside, NaN where infeasible. Raises RuntimeError where an optimum
-    with the circles misses one in flight.
+    Bonuses count in this comparison. Beside the arrays of `fly_solution` it returns
+
+    - `constrained` (n,): whether the optimum with the constraints is the better one
+    - `infeasible` (n,): whether no control reaches all circles; then the other optimum is taken
+    - `cost_free` (n,) and `terminal_error_free` (n, phases) of the optimum without the constraints
+    - `circle_price` (n, phases): what a unit of radius would save the optimum with the constraints, by their
+      multipliers; 0 if it ends inside the circle, NaN if infeasible
+
+    Raises NoOptimum if an optimum with the constraints misses a circle in flight.
     """
     u_free, cost_free, _, _ = optimise(env_id, x0, processes=processes, draw=draw)
     u, cost, feasible, multipliers = optimise(env_id, x0, in_circles=True, processes=processes, draw=draw)
@@ -227,7 +241,7 @@ def waypoint_reference(env_id: str, x0, processes: int | None = None, draw=None)
         values[constrained] = circled[key][constrained]
     price = np.full(free["hit"].shape, np.nan)
     with_circle = [k for k, phase in enumerate(PROBLEMS[env_id].phases) if phase.has_circle]
-    radius = np.array([np.max(PROBLEMS[env_id].phases[k].radius) for k in with_circle])  # of an ellipse its long axis
+    radius = np.array([np.max(PROBLEMS[env_id].phases[k].radius) for k in with_circle])  # an ellipse's long axis
     # on the edge d(|dx|^2 / r^2) / dr = -2 / r
     price[:, with_circle] = np.where(feasible[:, None], multipliers * 2 / radius, np.nan)
     compared = {"cost_free": free["cost"], "terminal_error_free": free["terminal_error"], "circle_price": price}
@@ -240,7 +254,7 @@ def waypoint_reference(env_id: str, x0, processes: int | None = None, draw=None)
 
 
 def summarise(problem: Problem, flight: dict) -> dict:
-    """What every problem's table begins with: means over the starts of a flight, flat and ready for JSON."""
+    """The first lines of every problem's table: means over the starts of a flight, flat and ready for JSON."""
     parts = ("cost", *(f"cost_{part}" for part in problem.parts))
     numbers = {f"{key}_mean": flight[key].mean() for key in parts}
     numbers |= {"episodic_return_mean": flight["episodic_return"].mean(), "hit_rate": flight["hit"].all(axis=1).mean()}
@@ -255,7 +269,7 @@ def summarise(problem: Problem, flight: dict) -> dict:
 
 
 def compare_double_integrator(env_id: str, x0, flight: dict) -> dict:
-    """Riccati's K_0 and P_0, and clipped LQR against unbounded LQR (cost x'P_0 x) and against the box QP."""
+    """Riccati's K_0 and P_0, and the clipped LQR against the unbounded LQR (cost x'P_0 x) and against the box QP."""
     K, P = lqr(PROBLEMS[env_id])
     unbounded = np.einsum("ni,ij,nj->n", x0, P[0], x0)
     saturated = (np.abs(np.einsum("tj,ntj->nt", K, flight["x"][:, :-1])) > PROBLEMS[env_id].u_max).any(axis=1)
@@ -300,17 +314,18 @@ def compare_waypoints(env_id: str, x0, flight: dict) -> dict:
 
 FINER = 4  # steps in place of one
 FINER_STARTS = 5
-ANOTHER_OPTIMUM = 1e-3  # relative loss
+ANOTHER_OPTIMUM = 1e-3  # a larger relative loss means that IPOPT found another local optimum
 
 
 def compare_finer(env_id: str, x0, flight: dict, draw) -> dict:
-    """The optimum of shorter steps, which a policy of longer ones cannot reach: by shooting and by collocation.
+    """The optimum in shorter steps, by shooting and by collocation. A policy with longer steps cannot reach it.
 
-    Over the first `FINER_STARTS` starts. The two transcriptions have nothing in common but the table's functions. With
-    bounds also `bound_price_needed`, the least `Problem.bound_price` with which crossing them does not pay. What was
-    not found has no key.
+    It is solved from the first `FINER_STARTS` starts. The two transcriptions share only the table's functions. With
+    bounds there is also `bound_price_needed`, the least `Problem.bound_price` with which crossing a bound does not pay.
+    A number that was not found has no key.
     """
-    problem, some = PROBLEMS[env_id], range(min(len(x0), FINER_STARTS))
+    problem = PROBLEMS[env_id]
+    some = range(min(len(x0), FINER_STARTS))
     jobs = [Job(env_id, shooting, problem.circles_count, k, x0[k], draw[k]) for k in some]
     best = [best_solution(job)[0] for job in jobs]
     numbers = {}
@@ -325,7 +340,7 @@ def compare_finer(env_id: str, x0, flight: dict, draw) -> dict:
         finer = [refined(job._replace(defect=defect), solution, FINER) for job, solution in zip(jobs, best)]
         costs = np.array([solution.cost for solution in finer])
         saves = flight["cost"][list(some)] - costs
-        # shorter steps cannot cost more: where they do, IPOPT has left for another local optimum
+        # shorter steps cannot cost more; if they do, IPOPT has gone to another local optimum
         found = saves >= -ANOTHER_OPTIMUM * np.abs(costs)
         if found.all() and all(solution.succeeded for solution in finer):
             numbers[f"{name}_cost_mean"] = costs.mean()
@@ -334,29 +349,31 @@ def compare_finer(env_id: str, x0, flight: dict, draw) -> dict:
 
 
 def compare(env_id: str, x0, flight: dict, draw) -> dict:
-    """What the reference `flight` from x0 (n, states) is compared with, by the kind of problem."""
+    """The numbers that the reference `flight` from x0 (n, states) is compared with, by the kind of problem."""
     problem = PROBLEMS[env_id]
     if env_id == DOUBLE_INTEGRATOR.env_id:
         return compare_double_integrator(env_id, x0, flight)
     if not problem.weighted or problem.has_events or problem.scores or problem.bounds:
         return compare_finer(env_id, x0, flight, draw)
-    return compare_waypoints(env_id, x0, flight) if problem.circles_count else compare_single_phase(env_id, x0, flight)
+    if problem.circles_count:
+        return compare_waypoints(env_id, x0, flight)
+    return compare_single_phase(env_id, x0, flight)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What is asked of a small problem's id (`phased/task.py`)
+# The optimum and the report of a small problem's id, for `phased/task.py`
 # ---------------------------------------------------------------------------------------------------------------------
 
 
 @lru_cache(maxsize=4)
 def kept_reference(env_id: str, problem: Problem, eval_seed: int, n: int) -> dict:
-    """`reference` from the n flights of a seed: evaluations during a training fly the same starts again and again."""
+    """`reference` of the n flights of a seed, which is kept because evaluations during a training fly it repeatedly."""
     x0, draw = flights_of_seed(problem, eval_seed, n)
     return reference(env_id, x0, draw=draw)
 
 
 def report(env_id: str, n: int, seed: int) -> tuple[dict, dict]:
-    """Solve the n flights of a seed and print the optimum beside what it is compared with: its numbers and arrays."""
+    """Solve the n flights of a seed, and print the optimum and its comparison. Returns the numbers and arrays."""
     problem = PROBLEMS[env_id]
     x0, draw = flights_of_seed(problem, seed, n)
     begin = time.perf_counter()
@@ -377,7 +394,7 @@ add_family(PROBLEMS, lambda env_id: PhasedTask(env_id, PROBLEMS[env_id], kept_re
 # Command line
 # ---------------------------------------------------------------------------------------------------------------------
 
-SHORT_NAMES = {  # of sub-commands; every problem has its id, too
+SHORT_NAMES = {  # short names of sub-commands; every id is one, too
     "DoubleIntegrator-v0": "double-integrator",
     "VanDerPol-v0": "van-der-pol",
     "DoubleIntegratorWaypoints-v0": "double-integrator-waypoints",
@@ -386,7 +403,7 @@ SHORT_NAMES = {  # of sub-commands; every problem has its id, too
 
 
 def save(args, numbers: dict, arrays: dict) -> None:
-    """Write the files asked for: the numbers as JSON, the trajectories as npz."""
+    """Write the files that were asked for: the numbers as JSON, the trajectories as npz."""
     if args.json:
         with replacing(args.json, "w") as file:
             json.dump(numbers, file, indent=2)

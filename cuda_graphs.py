@@ -1,9 +1,9 @@
-"""CUDA graphs: a rollout's step, a minibatch's gradient and its use, each as one launch of the GPU.
+"""CUDA graphs: a step of a rollout, a minibatch's gradient and the optimiser's step, each as one launch on the GPU.
 
-At Table 1's size a GPU computes most operations in a few microseconds, and PyTorch needs as long to launch each one. A
+At Table 1's size a GPU computes most operations in a few microseconds, and PyTorch takes as long to launch each one. A
 CUDA graph records the launches of a function once and repeats them together. It reads and writes the same memory each
-time, so inputs are copied to where the graph reads them. What decides whether a step is taken (NaN, the KL limit) stays
-outside.
+time, so inputs are copied to where the graph reads them. The decisions whether a step is taken (NaN, the KL limit) stay
+outside of the graphs.
 
 https://pytorch.org/docs/stable/notes/cuda.html#cuda-graphs
 """
@@ -19,7 +19,7 @@ import torch.nn.functional as F
 
 
 def speed_up(agent, average, optimizer, gradient):
-    """Compile the agent's network; on a GPU also replace what training calls again and again by CUDA graphs.
+    """Compile the agent's network. On a GPU also replace the functions that training repeats by CUDA graphs.
 
     Returns the gradient function that `train` is to call: `gradient` itself, or its CapturedGradient. Under torchrun
     nothing is captured, because the processes exchange numbers within the gradient.
@@ -44,13 +44,13 @@ def on_gpu(agent):
 
 
 def capture(function, warm_ups=3):
-    """A CUDA graph of function(), and what its calls return: tensors that each replay writes again.
+    """A CUDA graph of function(), and what function() returns: tensors that each replay writes again.
 
-    Before it, `warm_ups` calls let libraries choose their kernels. The capture itself computes nothing.
+    Before the capture, `warm_ups` calls let libraries choose their kernels. The capture itself computes nothing.
     """
     stream = torch.cuda.Stream()
     stream.wait_stream(torch.cuda.current_stream())
-    with torch.cuda.stream(stream), torch.random.fork_rng():  # which puts the random numbers back
+    with torch.cuda.stream(stream), torch.random.fork_rng():  # the random state is put back after the warm-up
         for _ in range(warm_ups):
             function()
     torch.cuda.current_stream().wait_stream(stream)
@@ -68,8 +68,8 @@ def capture(function, warm_ups=3):
 def ring_step(attention, x, ring, t):
     """RelativeAttention.step with a tensor t (1,): x (N, d) -> (N, d).
 
-    A graph cannot slice at another place in each replay. So keys and values (2, N, H, L + 1, dk) stand in a ring of
-    L + 1 slots: step t writes slot t mod (L + 1), which held step t - L - 1, and reads all slots.
+    A graph cannot slice at another place in each replay. So keys and values (2, N, H, L + 1, dk) are kept in a ring of
+    L + 1 slots. Step t writes slot t mod (L + 1), which held step t - L - 1. Then it reads all slots.
     """
     kv, projections = ring
     slots = torch.arange(kv.shape[3], device=x.device)
@@ -84,7 +84,7 @@ def ring_step(attention, x, ring, t):
 
 
 def new_rings(cache, L):
-    """A ring (kv, projections) for each block of an agent's `start_cache`. The memory stands in the slots 1 to L."""
+    """A ring (kv, projections) for each block of an agent's `start_cache`. The memory is in the slots 1 to L."""
     return [(F.pad(kv[..., :L, :], (0, 0, 1, 0)), projections.clone()) for kv, projections, _ in cache]
 
 
@@ -98,9 +98,9 @@ class CapturedAct:
 
     @torch.no_grad()
     def __call__(self, obs, cache, t):
-        """hidden (N, d) and actions (N, actions) of obs (N, obs); the next call overwrites them.
+        """hidden (N, d) and actions (N, actions) of obs (N, obs). The next call overwrites them.
 
-        At t = 0 the memory is read out of `cache`.
+        At t = 0 the memory is read from `cache`.
         """
         if self.graph is None:
             self.obs = obs.clone()
@@ -133,19 +133,21 @@ class CapturedAct:
 class CapturedGradient:
     """In place of a script's `ppo_gradient`: a graph for each size of a minibatch.
 
-    The optimiser's graph reads the gradients at one place. So all sizes bring theirs to the first size's tensors.
+    The optimiser's graph reads the gradients at one place. So the gradients of all sizes are copied to the tensors of
+    the first size.
     """
 
     def __init__(self, gradient):
         self.gradient = gradient
-        self.batch = None  # whose tensors the graphs read
-        self.copied = None  # the batch that was copied into them
+        self.batch = None  # the graphs read its tensors
+        self.copied = None  # the batch that was last copied into them
         self.graphs = {}
         self.gradients = None
 
     def __call__(self, args, agent, batch, mb, ent_coef):
-        if self.batch is None or self.batch.obs.shape != batch.obs.shape:  # episodes may get another length
-            self.batch, self.graphs = dataclasses.replace(batch), {}
+        if self.batch is None or self.batch.obs.shape != batch.obs.shape:  # the length of episodes may change
+            self.batch = dataclasses.replace(batch)
+            self.graphs = {}
             self.ent_coef = torch.zeros((), device=mb.device)
         elif batch is not self.copied:
             for field in dataclasses.fields(batch):
@@ -179,7 +181,7 @@ class CapturedGradient:
 
 
 class CapturedStep:
-    """In place of a fused Adam's `step`. The first call is a plain one, in which Adam makes its moments."""
+    """In place of a fused Adam's `step`. The first call is a plain step, in which Adam makes its moments."""
 
     def __init__(self, optimizer):
         self.step = optimizer.step
@@ -207,7 +209,7 @@ class CapturedStep:
 
 
 class CapturedAverage:
-    """In place of an AveragedModel's `update_parameters`. The first call is a plain one: it copies the weights."""
+    """In place of an AveragedModel's `update_parameters`. The first call is a plain one, which copies the weights."""
 
     def __init__(self, average, agent):
         self.average = average

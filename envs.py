@@ -1,23 +1,24 @@
 """The problems: dynamics and tables of the small ones, and every environment id.
 
-Importing this module registers the problems of the paper's section "Numerical Simulations",
+Importing this module registers the problems of the paper's section "Numerical Simulations":
 
     DoubleIntegrator-v0  DoubleIntegratorWaypoints-v0  VanDerPol-v0  VanDerPolWaypoints-v0  RocketAscent-v0
 
-what we add, the ascent with free final time and two landings of other papers,
+We add the ascent with free final time, two landings of other papers, and the files of `problems/` and `vehicles/`:
 
     RocketAscentCutoff-v0  MarsLanding-v0  PoweredDescent-v0
 
-and the problems and rockets in the files of `problems/` and `vehicles/`.
+`gymnasium.make(id)` gives one environment. `gymnasium.make_vec(id, num_envs=N)` gives N environments, stepped together
+in float64 NumPy without a Python loop over environments. The environments are `phased/environment.py` for the small
+problems, `rocket/environment.py` and `landing/environment.py`. Their base is `common/batch.py`. Users of environments
+can import all that they need from here.
 
-`gymnasium.make(id)` gives one environment, `gymnasium.make_vec(id, num_envs=N)` N of them, stepped together in float64
-NumPy with no Python loop over environments. The small problems' environment is `phased/environment.py`, the rocket's
-`rocket/environment.py`, the lander's `landing/environment.py`; what all share is `common/batch.py`. What a user of an
-environment needs is imported here, too.
+- To add a problem like the small ones, write its dynamics and table in a file of `problems/` that calls
+  `register_problem`.
+- To add a rocket or a lander, write a file of `vehicles/` that calls `register_rocket` or `register_lander`.
+- To add a family, write a folder, and add one line `add_family` at the end of this file.
+
 Reading order: dynamics, tables, registration.
-To add a problem of the first kind: a file in `problems/` with its dynamics and its table, which calls
-`register_problem`. To add a rocket or a lander: a file in `vehicles/` that calls `register_rocket` or
-`register_lander`. To add a family: a folder, and one line `add_family` at the end.
 """
 
 from __future__ import annotations
@@ -88,7 +89,7 @@ __all__ = [  # what users import from here
 ]  # fmt: skip
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Dynamics: x is a tuple of components, each a NumPy array over environments or a CasADi symbol
+# Dynamics. x is a tuple of components, each a NumPy array over environments or a CasADi symbol
 # ---------------------------------------------------------------------------------------------------------------------
 
 
@@ -158,7 +159,7 @@ VAN_DER_POL_WAYPOINTS = Problem(
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Registration (no max_episode_steps: the horizon is the problem's own, and its end, by our reading, a true one)
+# Registration (no max_episode_steps: the horizon is the problem's, and by our reading its end is a true end)
 # ---------------------------------------------------------------------------------------------------------------------
 
 BUILT_IN = (DOUBLE_INTEGRATOR, DOUBLE_INTEGRATOR_WAYPOINTS, VAN_DER_POL, VAN_DER_POL_WAYPOINTS)
@@ -167,13 +168,13 @@ for _problem in BUILT_IN:
 
 
 def import_files_of(folder: str):
-    """Run every file of a folder of tables; one that cannot be is left out with a line that says why."""
+    """Run every file of a folder of tables. A file that fails is left out, with a line that says why."""
     for path in sorted(Path(__file__).parent.glob(f"{folder}/*.py")):
         try:
             importlib.import_module(f"{folder}.{path.stem}")
         except BadInput as error:
             print(f"{folder}/{path.name} is left out: {error}", file=sys.stderr)
-        except Exception as error:  # whatever is wrong with one file must not stop the others
+        except Exception as error:  # a bad file must not stop the other files
             why = f"{type(error).__name__}: {error}"
             print(f"{folder}/{path.name} is left out: {why}", file=sys.stderr)
 
@@ -191,6 +192,6 @@ add_family(WITHOUT_OPTIMUM, BatchedTask)
 
 
 def own_ids() -> list[str]:
-    """The ids of a user's own: tables of `problems/`, and registered environments derived from `BatchedEnv`."""
+    """The ids that are not built in: tables of `problems/`, and registered environments derived from `BatchedEnv`."""
     built_in = {problem.env_id for problem in BUILT_IN}
     return [env_id for env_id in (*PROBLEMS, *WITHOUT_OPTIMUM) if env_id not in built_in]

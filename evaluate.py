@@ -1,4 +1,4 @@
-"""A policy against the optimum: `evaluate`, and the results folders. Needs no torch, imports no script.
+"""A policy against the optimum: `evaluate`, and the results folders. This module imports neither torch nor a script.
 
     python evaluate.py publish RUN_DIR results/di     # add a run to a results folder (--ship: make it the shipped one)
     python evaluate.py shorten RUN_DIR                # half the bytes: RUN_DIR/bfloat16 can be published instead
@@ -8,8 +8,8 @@
     python evaluate.py page results/rocket_dispersed       # one HTML file in which the policy flies in a browser
     python evaluate.py export results/rocket_cutoff --onnx policy.onnx     # the policy, or its flights, for other tools
 
-What is measured, printed and drawn of a problem is its family's: `phased/` and `rocket/`. Reading order: evaluation,
-results folders, exports, pages, command line.
+A problem's family (`phased/`, `rocket/`, `landing/`) says what is measured, printed and drawn. Reading order:
+evaluation, results folders, exports, pages, command line.
 """
 
 from __future__ import annotations
@@ -37,16 +37,16 @@ from formats.oem import oem_bytes
 from formats.policy import onnx_bytes
 from pages.assemble import html_bytes
 
-EPOCH = datetime(2026, 1, 1, tzinfo=UTC)  # of an exported lift-off
-LAUNCH_LONGITUDE = -80.6  # degrees east: Cape Canaveral
+EPOCH = datetime(2026, 1, 1, tzinfo=UTC)  # the moment of an exported lift-off
+LAUNCH_LONGITUDE = -80.6  # degrees east, Cape Canaveral
 
 
 def evaluate(env_id: str, policy, eval_seed: int, n: int, reference: dict | None = None, **env_options):
     """Fly `policy(obs (n, obs), t) -> action (n, actions)` on the n flights of a seed and compare it with the optimum.
 
-    `reference` is `task_of(env_id).optimum(eval_seed, n)`, solved here when it is not given; `env_options` go to the
-    environment. Returns the `metrics` of eval.json that do not depend on the run, as plain numbers, and the `arrays` of
-    eval.npz. Raises BadInput on an unknown id, ValueError if the reference belongs to other flights.
+    `reference` is `task_of(env_id).optimum(eval_seed, n)`, which is solved here if it is not given. `env_options` go to
+    the environment. Returns the `metrics` of eval.json that do not depend on the run, as plain numbers, and the
+    `arrays` of eval.npz. Raises BadInput for an unknown id, and ValueError if the reference belongs to other flights.
     """
     return task_of(env_id).evaluate(policy, eval_seed, n, reference, **env_options)
 
@@ -59,11 +59,12 @@ def evaluate(env_id: str, policy, eval_seed: int, n: int, reference: dict | None
 def publish(run_dir, folder, ship: bool = False, numbers: bool = False):
     """Add a run to a results folder: its eval.json and training curve under seeds/, and the policy if it is shipped.
 
-    The policy, its evaluation and the figures are replaced only where the folder ships none or with `ship`; with
-    `numbers` the folder holds seeds/ alone, and of a curve only the updates that were evaluated. The folder may keep a
-    part of the flights; its figures are drawn of all. OSError or ValueError says what is missing or does not fit;
-    nothing has been written then. All is drawn before, and seeds/<seed>.json is written last: where it is, the rest is,
-    too.
+    The policy, its evaluation and the figures are replaced only if the folder ships no policy, or with `ship`. With
+    `numbers` the folder gets only seeds/, and a curve has only the updates that were evaluated. The folder may keep a
+    part of the flights, but its figures show all.
+
+    Raises OSError or ValueError that says what is missing or does not fit. Then nothing has been written. All files are
+    made first, and seeds/<seed>.json is written last. So if it is there, the rest is there, too.
     """
     run_dir, folder = Path(run_dir), Path(folder)
     metrics, _ = read_evaluation(run_dir)
@@ -73,11 +74,13 @@ def publish(run_dir, folder, ship: bool = False, numbers: bool = False):
         raise ValueError(f"{run_dir} has no TensorBoard scalars")
     shipped = read_metrics(folder / "eval.json") if (folder / "eval.json").exists() else None
     for path in [*folder.glob("eval.json"), *(folder / "seeds").glob("*.json")]:
-        if (other := read_json(path)["env_id"]) != metrics["env_id"]:
+        other = read_json(path)["env_id"]
+        if other != metrics["env_id"]:
             raise ValueError(f"{run_dir} is of {metrics['env_id']}, {path} of {other}")
     if shipped and not ship and shipped["seed"] == metrics["seed"]:
         raise ValueError(f"{folder} already ships seed {metrics['seed']}; --ship replaces it")
-    seed, ships = metrics["seed"], (ship or not shipped) and not numbers
+    seed = metrics["seed"]
+    ships = (ship or not shipped) and not numbers
     with tempfile.TemporaryDirectory() as name:
         staged = Path(name)
         (staged / "seeds").mkdir()
@@ -96,15 +99,16 @@ def publish(run_dir, folder, ship: bool = False, numbers: bool = False):
 
 
 def refuse_another_policy(folder: Path, metrics: dict):
-    """ValueError where a folder's evaluation is not of its policy."""
+    """Raise ValueError if a folder's evaluation is not of its policy."""
     if metrics.get("checkpoint_sha256") != sha256_of(folder / "agent.safetensors"):
         raise ValueError(f"{folder}/eval.json is not of its agent.safetensors (checkpoint_sha256 differs)")
 
 
 def shorten(run_dir) -> Path:
-    """Make RUN_DIR/bfloat16, a run folder whose policy has its large weights in bfloat16 and is flown anew.
+    """Make RUN_DIR/bfloat16, a run folder whose policy has large weights in bfloat16 and is flown again.
 
-    OSError or BadInput says what is missing, ValueError what its script says when it cannot fly the policy.
+    Raises OSError or BadInput that says what is missing, or ValueError with the script's line if it cannot fly the
+    policy.
     """
     run_dir = Path(run_dir)
     args = read_checkpoint(run_dir / "agent.safetensors", {}, flag="")["args"]
@@ -136,13 +140,13 @@ def keep_excerpt(path, task):
 
 
 def of_another_policy(folder) -> list[str]:
-    """What a folder holds of the policy that it ships, beside the three files: it would look current."""
+    """The files of a folder's old policy, beside the three files. They would look current beside a new policy."""
     figures = [path for path in (folder / "figures").glob("*") if path.is_file()]
     return ["opponents.json", "opponents.npz", "page.html", *(f"figures/{path.name}" for path in figures)]
 
 
 def move(staged, folder, last, replaced):
-    """Put every file of `staged` into a folder, one of them last; before it goes what is `replaced` by none of them."""
+    """Put every file of `staged` into a folder. Before the `last` one delete `replaced` files without a new one."""
     files = [path for path in staged.rglob("*") if path.is_file()]
     for path in sorted(files, key=lambda path: (path == last, path)):
         if path == last:
@@ -155,7 +159,7 @@ def move(staged, folder, last, replaced):
 
 
 def redraw(folder) -> list[Path]:
-    """Draw the figures of a results or run folder from its files; returns their paths."""
+    """Draw the figures of a results or run folder from its files. Returns their paths."""
     folder = Path(folder)
     metrics, arrays = read_evaluation(folder)
     curves = {path.stem: read_csv(path) for path in sorted((folder / "seeds").glob("*.csv"))}
@@ -164,29 +168,30 @@ def redraw(folder) -> list[Path]:
 
 
 def draw_figures(folder, arrays: dict, metrics: dict, curves: list[dict]) -> list[Path]:
-    """Draw the figures of an evaluation, and of these training curves, into folder/figures; returns their paths."""
-    from drawing.style import save_figures  # Matplotlib takes a quarter of a second that only a drawing should cost
+    """Draw the figures of an evaluation and of these training curves into folder/figures. Returns their paths."""
+    from drawing.style import save_figures  # only a drawing should wait the quarter of a second that Matplotlib takes
 
     return save_figures(Path(folder) / "figures", task_of(metrics["env_id"]).figures(arrays, metrics, curves))
 
 
 def animate(folder) -> Path:
-    """Write figures/animation.gif of a results or run folder from its eval.json and eval.npz; returns its path."""
+    """Write figures/animation.gif of a results or run folder from its eval.json and eval.npz. Returns its path."""
     folder = Path(folder)
     metrics, arrays = read_evaluation(folder)
     return draw_animation(folder, arrays, metrics)
 
 
 def draw_animation(folder, arrays: dict, metrics: dict) -> Path:
-    """Write the animation of an evaluation, policy beside optimum, into folder/figures; returns its path."""
+    """Write the animation of an evaluation, policy beside optimum, into folder/figures. Returns its path."""
     path = Path(folder) / "figures" / "animation.gif"
     task_of(metrics["env_id"]).animation(arrays, metrics).write(path)
     return path
 
 
 def seed_lines(folder) -> list[str]:
-    """A table of a results folder's seeds with their medians and ranges, a row each figure; none for one seed."""
-    runs = sorted((read_json(path) for path in (Path(folder) / "seeds").glob("*.json")), key=lambda run: run["seed"])
+    """The table of a results folder's seeds, with a row for each number and its median and range. None for one seed."""
+    runs = [read_json(path) for path in (Path(folder) / "seeds").glob("*.json")]
+    runs.sort(key=lambda run: run["seed"])
     if len(runs) < 2:
         return []
     heads = [*(f"seed {run['seed']}" for run in runs), "median", "lowest", "highest"]
@@ -210,14 +215,14 @@ def seed_lines(folder) -> list[str]:
 
 
 def export(folder, targets: dict[str, Path], epoch: datetime = EPOCH, launch_longitude: float = LAUNCH_LONGITUDE):
-    """Write what other tools read of a results or run folder; `targets` are files by format.
+    """Write files for other tools from a results or run folder. `targets` are {format: file}:
 
     - onnx: one step of the policy, as a model
-    - csv: its flights, a row each step
-    - flights: its flights, a row each
+    - csv: its flights, a row for each step
+    - flights: its flights, a row for each
     - oem, czml: a rocket's flight around the Earth; lift-off is at `epoch`, from `launch_longitude` (degrees east)
 
-    BadInput where the folder has no such thing, or a package is missing. Then no file is written.
+    Raises BadInput if the folder cannot give a format, or if a package is missing. Then no file is written.
     """
     folder = Path(folder)
     made = {}
@@ -244,10 +249,10 @@ def export(folder, targets: dict[str, Path], epoch: datetime = EPOCH, launch_lon
 
 
 def page(folder, target=None, launch_longitude: float = LAUNCH_LONGITUDE) -> Path:
-    """Write the page of a results or run folder, in which its policy flies in a browser; returns its path.
+    """Write the page of a results or run folder, in which its policy flies in a browser. Returns its path.
 
-    `target` is page.html in the folder where it is not given; the longitude (degrees east) is a rocket's. OSError or
-    ValueError where a file is missing or bad, or there is no page of such an environment or policy.
+    `target` is by default page.html in the folder. Only rockets use the longitude (degrees east). Raises OSError or
+    ValueError if a file is missing or bad, or if there is no page for such an environment or policy.
     """
     folder = Path(folder)
     target = Path(target or folder / "page.html")
@@ -315,7 +320,7 @@ def page_command(args):
 
 
 def print_tables(folder: Path):
-    """A results or run folder's table, and that of its seeds."""
+    """Print the table of a results or run folder, and that of its seeds."""
     metrics = read_json(folder / "eval.json")
     print("\n".join([task_of(metrics["env_id"]).table(metrics), *seed_lines(folder)]))
 
@@ -339,7 +344,7 @@ FORMATS = {
 
 
 def parse_args(argv=None):
-    """A sub-command and what it takes."""
+    """The arguments of a sub-command."""
     parser = OneLineParser(description="Results folders: add a run, redraw figures, print the table.")
     commands = parser.add_subparsers(dest="command", required=True)
     command = commands.add_parser("publish", help="add a run to a results folder")
@@ -388,7 +393,7 @@ def parse_args(argv=None):
 
 
 def main():
-    """Run the sub-command; what can go wrong in it ends in one line."""
+    """Run the sub-command. An error in it ends in one line."""
     args = parse_args()
     try:
         COMMANDS[args.command](args)

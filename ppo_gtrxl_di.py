@@ -1,14 +1,17 @@
 """PPO with a Gated Transformer-XL on the double integrator, measured against the true optimum in the same run.
 
-    python ppo_gtrxl_di.py --seed 1                                        # by our recipe, as results/di
+    python ppo_gtrxl_di.py --seed 1                                        # our recipe, which trained results/di
     python ppo_gtrxl_di.py --seed 1 --env-id DoubleIntegratorWaypoints-v0  # two waypoints, one policy
     python ppo_gtrxl_di.py --seed 1 --recipe paper                         # plain PPO with Table 1
     python ppo_gtrxl_di.py --eval-only --checkpoint results/di/agent.safetensors
 
-Top to bottom: arguments, recipes, problem, Gated Transformer-XL, agent, PPO, what we add to it, training, main.
-From the first "Shared" on, all ppo_gtrxl_*.py are the same to the letter. A section with "ours" in its heading has
-nothing from the paper; elsewhere a comment says so. T steps, N environments (Algorithm 1 calls these E, and its
-iterations N), L memory length, d width, H heads, dk = d / H.
+Reading order: arguments, recipes, problem, Gated Transformer-XL, agent, PPO, what we add to PPO, training, main.
+From the first section "Shared" on, all ppo_gtrxl_*.py are the same to the letter. A section with "ours" in its heading
+contains nothing from the paper. In the other sections a comment marks what is ours. "Line 8" means line 8 of
+Algorithm 1.
+
+T is the number of steps, N of environments, H of heads. L is the memory length, d the width, and dk = d / H.
+Algorithm 1 writes E for our N, and N for its iterations.
 """
 
 from __future__ import annotations
@@ -32,33 +35,34 @@ from runs import Schedule, all_reduce_sum
 
 @dataclass
 class Args:
-    """The flags. The values written here are Table 1's column of this problem: --recipe paper uses them as they are.
+    """The flags of the script. The values written here are Table 1's for this problem.
 
-    --recipe ours, the default, first replaces those in RECIPES. A flag that is typed wins over both. A Schedule is one
-    number, or points "place:value place:value ...": place 0 is the first update, 1 the last (`value_at` reads it).
+    --recipe paper uses these values. --recipe ours, the default, first replaces those that RECIPES names. A flag that
+    is typed wins over both. A Schedule is one number, or points "place:value place:value ...". Place 0 is the first
+    update, place 1 the last (`value_at`).
     """
 
     # experiment
     exp_name: str = Path(__file__).stem  # the name of this experiment
     seed: int = 1  # seed of the experiment
-    recipe: str = "ours"  # the flags that are not typed: "ours" (RECIPES, then these) or "paper" (these)
+    recipe: str = "ours"  # what the flags that are not typed are: "paper" (these values) or "ours" (RECIPES first)
     torch_deterministic: bool = True  # if toggled, `torch.backends.cudnn.deterministic=True`
     cuda: bool = True  # if toggled, a GPU is used when there is one
-    num_threads: int = 1  # CPU threads of torch (0: torch's own choice); bits depend on it
-    torch_compile: bool = False  # compile the network, on a GPU into CUDA graphs: a slow start, then quick updates
+    num_threads: int = 1  # CPU threads of torch (0: torch's own choice); the bits of the results depend on it
+    torch_compile: bool = False  # compile the network (on a GPU: CUDA graphs), for a slower start and faster updates
     track: bool = False  # if toggled, this experiment will be tracked with Weights and Biases
     wandb_project_name: str = "ppo-gtrxl"  # the wandb's project name
     wandb_entity: str | None = None  # the entity (team) of wandb's project
     capture_video: bool = False  # draw the final evaluation into the run's folder: animation.gif and the figures
     save_model: bool = True  # write checkpoints and the evaluation (off: TensorBoard events only)
     checkpoint: str | None = None  # start from these weights (.safetensors)
-    resume: str | None = None  # run folder of an interrupted run to go on with, bit for bit
+    resume: str | None = None  # go on with the interrupted run in this run folder, bit for bit
     eval_only: bool = False  # fly the mean action of --checkpoint, train nothing, write only --eval-json and --eval-npz
-    eval_starts: int | None = None  # number of evaluation starts (default: 1000; a training cut short: 50)
+    eval_starts: int | None = None  # number of evaluation starts (default 1000; 50 in a training cut short)
     eval_seed: int = 0  # seed of the evaluation starts
     eval_json: str | None = None  # where --eval-only writes the metrics
     eval_npz: str | None = None  # where --eval-only writes the trajectories
-    eval_every: int = 10  # evaluate every so many updates, on starts of its own (0: only at the end)
+    eval_every: int = 10  # updates between two evaluations, which have their own starts (0: only at the end)
 
     # environment
     env_id: str = "DoubleIntegrator-v0"  # the id of the environment, one of ENV_IDS
@@ -98,9 +102,9 @@ class Args:
     weight_average: float = 0.0  # decay, per optimiser step, of the averaged weights used in evaluation
 
 
-# Recipes: the values that we replace (beside Table 1's: docs/decisions.md; why: docs/method.md) -----------------------
-# --log-std falls as a learned one did in earlier trainings, until flights are compared in groups. There it jumps down,
-# and from there it falls linearly. --flights-per-start, --log-std and --log-radius jump at the same place.
+# Recipes: the values that we replace (docs/decisions.md has Table 1's beside them, docs/method.md the reasons) --------
+# --log-std first falls as a learned one does. It jumps down where flights begin to be compared in groups, and falls
+# linearly from there. --flights-per-start, --log-std and --log-radius jump at the same place.
 OURS = {
     "gae_lambda": "0:0.95 1:1",
     "target_kl": 0.05,
@@ -136,20 +140,20 @@ RECIPES = {
 
 
 def recipe(args):
-    """What our recipe changes for the environments of `args`; an id without a recipe takes the first."""
+    """What our recipe changes for the environments of `args`. An id without a recipe takes the first one."""
     return RECIPES.get(args.env_id, RECIPES[ENV_IDS[0]])
 
 
 # Problem: input and action --------------------------------------------------------------------------------------------
 ENV_IDS = ("DoubleIntegrator-v0", "DoubleIntegratorWaypoints-v0")
 ENV_OPTIONS = ("observe_phase", "observe_velocity")  # arguments of the environments
-FIXED_OPTIONS = {"scaled_action": True}  # those that no flag sets
-BUFFERS = ForEachId(ENV_IDS, runs.observation_scale)  # by id; `features` reads agent.<name>
+FIXED_OPTIONS = {"scaled_action": True}  # arguments that no flag sets
+BUFFERS = ForEachId(ENV_IDS, runs.observation_scale)  # by environment id; `features` reads them as agent.<name>
 INITIAL_ACTION = [0.0]  # the policy's output before training, in units of the bound
 
 
 def features(agent, obs):
-    """What the encoder sees of observations (..., obs)."""
+    """What the encoder sees of observations (..., obs): the observations in units of their scale."""
     return obs / agent.observation_scale
 
 
@@ -159,7 +163,7 @@ def mean_action(output, action_scale):
 
 
 def describe(episodes, metrics):
-    """What a progress line says of the sampled episodes (`final_info` arrays) and of the last evaluation, if any."""
+    """The part of a progress line about the sampled episodes (`final_info` arrays) and the last evaluation, if any."""
     words = f"return {episodes['episodic_return'].mean():8.2f}"
     if "cost" in episodes:
         words += f"  cost {episodes['cost'].mean():7.3f}"
@@ -175,13 +179,15 @@ BONUS_WIDTH = 0.4
 
 
 def set_curriculum(envs, args, progress):
-    """Set what only training changes; returns how many flights in a row have the same start.
+    """Set what only training changes. Returns how many flights in a row have the same start.
 
-    At first every flight has its own start; later several share one, and are compared. A waypoint's circle is wide at
-    first, so that flights find it, and shrinks to its true radius. Compared flights aim at circles a tenth smaller: the
-    optimum ends on the circle's edge, where a flight with noise would miss half the time. Beyond the circle their bonus
-    falls to 0 over BONUS_WIDTH, by 20 / 0.4 = 50 for each unit of distance. A miss saves 4 or 12 a unit (`circle_price`
-    of baselines.py), so it does not pay. A steeper fall would hide the cost.
+    At first every flight has its own start. Later several flights share a start and are compared.
+
+    A waypoint's circle is wide at first, so that flights find it. It shrinks to its true radius. Compared flights aim
+    at circles a tenth smaller, because the optimum ends on the edge of the true circle, where half of the noisy flights
+    would miss. Beyond the circle their bonus falls to 0 over BONUS_WIDTH, by 20 / 0.4 = 50 for each unit of distance. A
+    miss saves 4 or 12 for each unit (`circle_price` of baselines.py), so it does not pay. A steeper fall would hide
+    the cost.
     """
     group = round(value_at(args.flights_per_start, progress))
     envs.flights_per_start = group
@@ -192,16 +198,16 @@ def set_curriculum(envs, args, progress):
 
 
 def add_rewards(envs, args, progress, batch, episodes):
-    """Nothing to do here: training is paid what the environment pays. The rocket's script adds to it."""
+    """Does nothing here. Training is paid what the environment pays; the rocket's script adds to it."""
 
 
 def before_training(agent, args, env_options):
-    """Nothing to do here. The rocket's script prepares its agent for flights that differ."""
+    """Does nothing here. The rocket's script prepares its agent for vehicles that differ."""
 
 
 # Shared: Gated Transformer-XL ("Gated Transformer-XL Implementation") -------------------------------------------------
 def linear(inputs, outputs, gain=1.0, bias=0.0):
-    """A linear layer with orthogonal weights and a constant bias (CleanRL's layer_init), or without one (None)."""
+    """A linear layer with orthogonal weights and a constant bias, as CleanRL's layer_init. None leaves the bias out."""
     layer = nn.Linear(inputs, outputs, bias=bias is not None)
     nn.init.orthogonal_(layer.weight, gain)
     if bias is not None:
@@ -210,7 +216,10 @@ def linear(inputs, outputs, gain=1.0, bias=0.0):
 
 
 class Gate(nn.Module):
-    """gate(x, y) = lambda x + (1 - lambda) y, lambda = sigmoid(W_g [x, y] + b_g); b_g > 0 begins near the identity."""
+    """gate(x, y) = lambda x + (1 - lambda) y, lambda = sigmoid(W_g [x, y] + b_g), of x and y (..., d).
+
+    With b_g > 0 an untrained gate is near the identity gate(x, y) = x.
+    """
 
     def __init__(self, embed_dim):
         super().__init__()
@@ -224,7 +233,7 @@ class Gate(nn.Module):
 class RelativeAttention(nn.Module):
     """Multi-head attention over a sliding window: A_ij = (x_i W^Q) (x_j W^K + R_{i-j})^T / sqrt(d_k), i - L <= j <= i.
 
-    R is learned, one vector for each head and distance 0..L; j runs over the memory and the episode.
+    j runs over the memory and the episode. R is learned. It has one vector for each head and each distance 0 to L.
     """
 
     def __init__(self, embed_dim, num_heads, memory_length):
@@ -248,7 +257,7 @@ class RelativeAttention(nn.Module):
         L, H, dk = self.memory_length, self.num_heads, self.dk
         chunks = math.ceil(T / max(L // 2, 64))
         C = math.ceil(T / chunks)
-        pad = (0, 0, 0, chunks * C - T)  # steps after the last, so that every chunk has C
+        pad = (0, 0, 0, chunks * C - T)  # zeros after the last step give every chunk C steps
         context = torch.cat([memory, x], dim=1)  # (N, L + T, d)
 
         q = F.pad(self.query(x) / math.sqrt(dk), pad)  # (N, chunks * C, d)
@@ -265,12 +274,13 @@ class RelativeAttention(nn.Module):
         return self.out(attended[:, :T])
 
     def position_scores(self, q):
-        """q_i R_{i-j}^T of q (N, chunks, H, C, dk) for all keys of its window: (..., C, L + C), -inf out of reach.
+        """q_i R_{i-j}^T of q (N, chunks, H, C, dk) for all keys j of its window: (N, chunks, H, C, L + C).
 
-        Key i + L of a window is query i itself, so query i reaches the keys i to i + L. `products` has a row for each
-        query and a column for each distance, L first: row i has to move right by i. One reshape does it: pad each row
-        with C columns of -inf, join the rows to one line, and cut that into rows which are one column shorter. For
-        L = 2, C = 3 (a2: query a at distance 2; ".": -inf):
+        Key i + L of a window is query i itself, so query i reaches the keys i to i + L. All other keys get -inf.
+
+        `products` has a row for each query and a column for each distance, L first. Row i has to move right by i. One
+        reshape moves all rows: pad each row with C columns of -inf, join the rows to one line, and cut this line into
+        rows that are one column shorter. Here L = 2 and C = 3; a2 is query a at distance 2, and "." is -inf:
 
             a2 a1 a0 .  .  .        a2 a1 a0 .  .
             b2 b1 b0 .  .  .   ->   .  b2 b1 b0 .
@@ -282,11 +292,11 @@ class RelativeAttention(nn.Module):
         return line[..., : C * (L + C)].unflatten(-1, (C, L + C))
 
     def start_cache(self, memory, steps):
-        """What `step` needs, for episodes of at most `steps` steps with the memory (N, L, d):
+        """The cache of `step`, for episodes of at most `steps` steps that begin with the memory (N, L, d):
 
-        - kv (2, N, H, L + steps, dk), keys and values: the memory's, then room for those of the steps
-        - the projections W^Q / sqrt(dk), W^K and W^V as one matrix (3 d, d)
-        - R (H, L + 1, dk), distance L first, as the window's keys are ordered
+        - kv (2, N, H, L + steps, dk): keys and values of the memory, then room for those of the steps
+        - projections (3 d, d): W^Q / sqrt(dk), W^K and W^V as one matrix
+        - R (H, L + 1, dk): distance L first, which is the order of the window's keys
         """
         kv = torch.stack([self.key(memory), self.value(memory)])  # (2, N, L, d)
         kv = kv.unflatten(-1, (self.num_heads, self.dk)).transpose(2, 3)  # (2, N, H, L, dk)
@@ -295,7 +305,10 @@ class RelativeAttention(nn.Module):
         return kv, projections, self.R.flip(1)
 
     def step(self, x, cache, t):
-        """Step t alone: x (N, d) -> (N, d); writes its key and value into the cache, reads the window before it."""
+        """MultiHead(x) of step t alone: x (N, d) -> (N, d).
+
+        It writes the step's key and value into the cache. Then it attends to the window that ends with them.
+        """
         kv, projections, R = cache
         L = self.memory_length
         qkv = F.linear(x, projections)  # (N, 3 d)
@@ -320,7 +333,7 @@ class GTrXLBlock(nn.Module):
         self.mlp = nn.Sequential(linear(embed_dim, mlp_dim), nn.GELU(), linear(mlp_dim, embed_dim))
 
     def forward(self, x, attended):
-        """x is the block's input, `attended` its MultiHead(x), of the whole segment or of one step."""
+        """h2 of the block's input x and `attended`, its MultiHead(x): (..., d) each, whole episodes or one step."""
         h1 = self.gate1(x, self.norm1(x + attended))
         return self.gate2(h1, self.norm2(h1 + self.mlp(h1)))
 
@@ -330,12 +343,13 @@ LOG_STD_RANGE = (-8.0, 0.5)
 
 
 class Agent(nn.Module):
-    """Actor and critic on one GTrXL trunk. The Gaussian policy has one log-std for all states, learned or set.
+    """Actor and critic on one GTrXL trunk. The policy is Gaussian, with one log-std for all states, learned or set.
 
-    A block's memory at step t is what the block received at the steps t - L to t - 1, and m_0 before the first step.
-    A rollout stores it as keys and values (`encode_step`). Training stores only m_0, and computes the whole episode
-    again from it with the current weights (`encode`); so gradients flow through the memory. This replaces lines 10, 11
-    and 17. Line 10 also stores the action a_t. We leave it out: two states that are fully observed tell the action.
+    A block's memory at step t is what the block received at the steps t - L to t - 1. Before the first step it is m_0.
+    A rollout stores the memory as keys and values (`encode_step`). Training stores only m_0. It computes the whole
+    episode again from m_0 with the current weights (`encode`), so gradients flow through the memory. This replaces
+    lines 10, 11 and 17. Line 10 also stores the action a_t. We leave the action out, because two fully observed states
+    in a row tell which action lay between them.
     """
 
     def __init__(self, args, envs):
@@ -359,13 +373,15 @@ class Agent(nn.Module):
         self.actor = nn.Sequential(linear(d, hidden, gain=2**0.5), nn.GELU(), linear(hidden, actions, gain=0.01))
         self.actor[-1].bias.data[:] = torch.tensor(INITIAL_ACTION)
         self.critic = nn.Sequential(linear(d, hidden, gain=2**0.5), nn.GELU(), linear(hidden, 1))
-        learned = not isinstance(args.log_std, str)  # a number: learned from there; points: set by them
+        learned = not isinstance(args.log_std, str)  # a number is where learning begins; points are set
         self.actor_logstd = nn.Parameter(torch.full((actions,), value_at(args.log_std, 0.0)), requires_grad=learned)
 
     def new_memory(self, num_envs, noise):
         """m_0 ~ N(0, noise^2), drawn once per episode and block: (blocks, N, L, d)."""
         zeros = self.actor_logstd.new_zeros(self.num_blocks, num_envs, self.memory_length, self.embed_dim)
-        return zeros.normal_(std=noise) if noise else zeros  # without noise nothing is drawn
+        if not noise:
+            return zeros  # nothing is drawn
+        return zeros.normal_(std=noise)
 
     def encode(self, obs, memory):
         """Whole episodes in parallel (training): obs (N, T, obs), memory (blocks, N, L, d) -> hidden (N, T, d)."""
@@ -380,18 +396,18 @@ class Agent(nn.Module):
         return [block.attention.start_cache(m, steps) for block, m in zip(self.blocks, memory)]
 
     def encode_step(self, obs, cache, t):
-        """Step t of the same episodes (rollout): obs (N, obs) -> hidden (N, d); its cost does not grow with t."""
+        """Step t of the same episodes (rollout): obs (N, obs) -> hidden (N, d). The cost does not grow with t."""
         x = self.encoder(features(self, obs))
         for block, block_cache in zip(self.blocks, cache):
             x = block(x, block.attention.step(x, block_cache, t))
         return x
 
     def get_mean_action(self, hidden):
-        """What evaluation flies: the policy without its noise."""
+        """The policy without its noise, which evaluation flies: actions (..., actions) of hidden (..., d)."""
         return mean_action(self.actor(hidden), self.action_scale)
 
     def get_policy(self, hidden):
-        """The Gaussian that training samples from, of hidden (..., d): over actions (..., actions), in their unit."""
+        """The Gaussian that training samples from: over actions (..., actions) in their unit, of hidden (..., d)."""
         mean = self.get_mean_action(hidden)
         std = self.actor_logstd.clamp(*LOG_STD_RANGE).exp()
         return Normal(mean, std.expand_as(mean), validate_args=False)
@@ -399,10 +415,11 @@ class Agent(nn.Module):
     def act(self, obs, cache, t):
         """Step t of a rollout: hidden (N, d) and sampled actions (N, actions) of obs (N, obs)."""
         hidden = self.encode_step(obs, cache, t)  # lines 7 and 10
-        return hidden, self.get_policy(hidden).rsample()  # line 8; a GPU would be waited for by `sample`
+        actions = self.get_policy(hidden).rsample()  # line 8; `sample` would wait for a GPU
+        return hidden, actions
 
     def evaluate_actions(self, hidden, actions):
-        """log pi(a|s), entropy and critic's output, (...) each, of hidden (..., d) and actions (..., actions)."""
+        """log pi(a|s), entropy and the critic's output, (...) each, of hidden (..., d) and actions (..., actions)."""
         probs = self.get_policy(hidden)
         logprob = probs.log_prob(actions).sum(-1)
         entropy = probs.entropy().sum(-1)
@@ -410,9 +427,9 @@ class Agent(nn.Module):
         return logprob, entropy, value
 
     def make_policy(self, steps):
-        """The function policy(obs (N, obs), t) -> mean actions (N, actions), in NumPy, that evaluation flies.
+        """The function that evaluation flies: policy(obs (N, obs), t) -> mean actions (N, actions), in NumPy.
 
-        At t = 0 it begins new episodes, with a memory of zeros.
+        A call with t = 0 begins new episodes, of at most `steps` steps, with a memory of zeros.
         """
         dtype, device = self.actor_logstd.dtype, self.actor_logstd.device
         cache = []
@@ -430,22 +447,25 @@ class Agent(nn.Module):
 # Shared: PPO (Algorithm 1) --------------------------------------------------------------------------------------------
 @dataclass
 class Batch:
-    """The episodes of one update; `alive` is 1 up to an episode's last step, 0 after it."""
+    """The episodes of one update. `alive` is 1 up to an episode's last step and 0 after it."""
 
     obs: torch.Tensor  # (T, N, obs)
     actions: torch.Tensor  # (T, N, actions)
     logprobs: torch.Tensor  # (T, N)
     rewards: torch.Tensor  # (T, N), scaled
-    critic: torch.Tensor  # (T, N), its output; V of `returns_baseline` is made of it
+    critic: torch.Tensor  # (T, N), the critic's output, from which `returns_baseline` makes V
     alive: torch.Tensor  # (T, N)
     memory: torch.Tensor  # (blocks, N, L, d), m_0
     advantages: torch.Tensor | None = None  # (T, N), set by train
-    targets: torch.Tensor | None = None  # (T, N), set by train: what the critic learns
+    targets: torch.Tensor | None = None  # (T, N), set by train; the critic learns them
 
 
 @torch.no_grad()
 def rollout(agent, envs, reward_scale, memory_noise):
-    """Fly one episode in each environment (lines 3-13): this process's Batch, and all processes' `final_info`."""
+    """Fly one episode in each environment (lines 3-13).
+
+    Returns this process's Batch, and {key: (episodes, ...)} of `final_info` for the episodes of all processes.
+    """
     T, N = envs.episode_steps, envs.num_envs
     zeros = agent.actor_logstd.new_zeros  # on the agent's device, in its precision
     batch = Batch(
@@ -464,26 +484,26 @@ def rollout(agent, envs, reward_scale, memory_noise):
     alive = np.ones(N, dtype=bool)
     episodes = {}  # `final_info` of each environment's first episode
     next_obs, _ = envs.reset()
-    batch.obs[:] = torch.as_tensor(next_obs)  # after the last episode's end: features of zeros could be NaN
+    batch.obs[:] = torch.as_tensor(next_obs)  # no step stays zero: the features of zeros could be NaN
 
     for t in range(T):  # line 6
         batch.obs[t] = torch.as_tensor(next_obs)
         alive_at[t] = alive
         hidden[t], batch.actions[t] = agent.act(batch.obs[t], cache, t)  # lines 7, 8 and 10
-        # line 9; an episode's end is a true end: V is 0 there, and nothing is ever truncated
+        # line 9. The end of an episode is a true end, where V is 0: nothing is ever truncated.
         next_obs, reward, terminated, _, info = envs.step(batch.actions[t].cpu().numpy())
         rewards[t] = reward * alive * reward_scale
         ended = alive & terminated
         for key, value in info.get("final_info", {}).items():
             first_episodes = episodes.setdefault(key, np.zeros_like(value))
             first_episodes[ended] = value[ended]
-        alive = alive & ~terminated  # an ended environment has started anew; only its first episode counts
+        alive = alive & ~terminated  # an ended environment starts a new episode, which does not count
         if not alive.any():
             break
 
     batch.rewards[:] = torch.as_tensor(rewards)
     batch.alive[:] = torch.as_tensor(alive_at)
-    # v_t of line 8 and log pi(a_t), for all steps in one call: sampling needs neither
+    # v_t of line 8 and log pi(a_t). Sampling needs neither, so one call computes them for all steps.
     batch.logprobs, _, batch.critic = agent.evaluate_actions(hidden, batch.actions)
     of_each_process = runs.all_gather(episodes)
     all_episodes = {key: np.concatenate([part[key] for part in of_each_process]) for key in episodes}
@@ -491,11 +511,15 @@ def rollout(agent, envs, reward_scale, memory_noise):
 
 
 def gae(rewards, values, alive, gamma, gae_lambda):
-    """A_t = sum_l (gamma lambda)^l delta_{t+l} and the returns A + V, all (T, N); V is 0 beyond an episode's end."""
+    """Advantages A_t = sum_l (gamma lambda)^l delta_{t+l} and returns A_t + V_t, all (T, N).
+
+    delta_t = r_t + gamma V_{t+1} - V_t, where V is 0 beyond an episode's end.
+    """
     device = rewards.device
-    rewards, values, alive = rewards.cpu(), values.cpu(), alive.cpu()  # a GPU would take longer: T small steps
+    rewards, values, alive = rewards.cpu(), values.cpu(), alive.cpu()  # a GPU is slower at T small steps
     advantages = torch.zeros_like(rewards)
-    lastgaelam = next_value = torch.zeros_like(values[0])
+    lastgaelam = torch.zeros_like(values[0])
+    next_value = torch.zeros_like(values[0])
     for t in reversed(range(len(rewards))):
         delta = rewards[t] + gamma * next_value - values[t]
         lastgaelam = (delta + gamma * gae_lambda * lastgaelam) * alive[t]
@@ -505,7 +529,7 @@ def gae(rewards, values, alive, gamma, gae_lambda):
 
 
 def moments(x, alive, dim):
-    """Mean and variance along dim of the living steps of every process."""
+    """Mean and variance of x along dim, over the living steps of all processes. `dim` is kept with length 1."""
     count = all_reduce_sum(alive.sum(dim, keepdim=True)).clamp(min=1)
     mean = all_reduce_sum((x * alive).sum(dim, keepdim=True)) / count
     variance = all_reduce_sum(((x - mean) ** 2 * alive).sum(dim, keepdim=True)) / count
@@ -513,17 +537,18 @@ def moments(x, alive, dim):
 
 
 def explained_variance(prediction, returns, alive):
-    """1 - Var(returns - prediction) / Var(returns) over the living steps, as CleanRL's."""
-    _, left = moments(returns - prediction, alive, (0, 1))
-    _, all_of_it = moments(returns, alive, (0, 1))
-    return (1 - left / all_of_it).item()
+    """1 - Var(returns - prediction) / Var(returns) over the living steps of (T, N), as in CleanRL."""
+    _, unexplained = moments(returns - prediction, alive, (0, 1))
+    _, total = moments(returns, alive, (0, 1))
+    return (1 - unexplained / total).item()
 
 
 def ppo_loss(agent, batch, mb, clip_coef, vf_coef, ent_coef):
-    """-L_CLIP + c1 L_VF - c2 H over the living steps of the episodes `mb`; returns it and what is logged.
+    """The loss -L_CLIP + c1 L_VF - c2 H over the living steps of the episodes `mb`, and the means that are logged.
 
-    The paper's sum with the sign that raises L_CLIP, and L_VF = 1/2 (critic - target)^2. Under torchrun the loss is
-    this process's part of the mean (the gradients are then summed), what is logged is of all.
+    The paper prints L_CLIP + c1 L_VF - c2 H. Our sign of L_CLIP raises it where the loss is minimised. L_VF is
+    1/2 (critic - target)^2. Under torchrun the loss is this process's part of the mean, and `ppo_gradient` sums the
+    gradients. What is logged is the mean over all processes.
     """
     alive = batch.alive[:, mb]
     advantages = batch.advantages[:, mb]
@@ -557,20 +582,24 @@ def ppo_loss(agent, batch, mb, clip_coef, vf_coef, ent_coef):
 
 
 def ppo_gradient(args, agent, batch, mb, ent_coef):
-    """Set the parameters' `.grad` to the gradient of `ppo_loss`, clipped; returns what is logged, with its norm."""
+    """Set the parameters' `.grad` to the clipped gradient of `ppo_loss`.
+
+    Returns what is logged, with the norm that the gradient had before it was clipped.
+    """
     loss, losses = ppo_loss(agent, batch, mb, args.clip_coef, args.vf_coef, ent_coef)
     agent.zero_grad()
     loss.backward()
-    runs.sum_gradients(agent)  # over torchrun's processes
+    runs.sum_gradients(agent)  # over the processes of torchrun
     losses["gradient_norm"] = nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
     return losses
 
 
 # Shared, ours: what we add to PPO -------------------------------------------------------------------------------------
 def value_at(schedule, progress):
-    """The value of "0:-1 0.4:-2 1:-6" at `progress`, 0 in the first update and 1 in the last; a number is constant.
+    """The value of a schedule at `progress`, which is 0 in the first update and 1 in the last.
 
-    Linear between the points; of two points at one place the second counts from there on.
+    A number is constant. Points "0:-1 0.4:-2 1:-6" are joined by lines. If two points have one place, the second counts
+    from there on.
     """
     if not isinstance(schedule, str):
         return schedule
@@ -581,7 +610,7 @@ def value_at(schedule, progress):
 
 
 def set_log_std(agent, args, progress):
-    """Set the log-std of this update if --log-std is a schedule; clamp it if it is learned.
+    """Set the log-std of this update if --log-std is a schedule. Clamp it if it is learned.
 
     Beyond LOG_STD_RANGE the clamp in `get_policy` has no gradient, so a learned log-std would never come back.
     """
@@ -592,7 +621,7 @@ def set_log_std(agent, args, progress):
 
 
 def learning_rate_of(agent, args, progress):
-    """The learning rate of this update; with --lr-times-std it is multiplied by the policy's standard deviation.
+    """The learning rate of this update. With --lr-times-std it is multiplied by the policy's standard deviation.
 
     Two policies whose means differ by delta have the KL divergence delta^2 / (2 std^2). A step of Adam moves each
     weight by about the learning rate, so it moves the mean by an amount in proportion to the learning rate. If the
@@ -606,21 +635,26 @@ def learning_rate_of(agent, args, progress):
 
 
 def linear_fit(x, y, alive):
-    """The value that a linear regression predicts for y (..., G) from x (..., G, k), over a group's G episodes.
+    """The values (..., G) that a linear regression of y (..., G) on x (..., G, k) predicts, over a group's G episodes.
 
     Only living episodes count. The regression has a small ridge penalty. An episode's own return is part of its fit.
     So its residual is smaller by the factor 1 - leverage, and an episode in an extreme state counts less. The leverage
     depends on the states of this step and not on the action. So with --gae-lambda 1 the expected policy gradient of a
-    state keeps its direction; below 1 this holds only approximately. Fits that leave the episode out were worse:
-    docs/archive.md.
+    state keeps its direction. Below 1 this holds only approximately. Fits that leave the episode out are worse
+    (docs/archive.md).
     """
-    x, y = x.double(), y.double()[..., None]
+    x = x.double()
+    y = y.double()[..., None]  # (..., G, 1)
     weight = alive.double()[..., None]  # (..., G, 1)
     count = weight.sum(-2, keepdim=True).clamp(min=1)  # (..., 1, 1)
+
+    x_mean = (x * weight).sum(-2, keepdim=True) / count
     y_mean = (y * weight).sum(-2, keepdim=True) / count
-    x = (x - (x * weight).sum(-2, keepdim=True) / count) * weight  # centred
-    x = x / ((x * x).sum(-2, keepdim=True) / count).sqrt().add(1e-6)  # of unit spread
-    # a column that is equal in all episodes (the time) is zero here; the ridge keeps the matrix invertible
+    x = (x - x_mean) * weight
+    spread = ((x * x).sum(-2, keepdim=True) / count).sqrt()
+    x = x / spread.add(1e-6)
+
+    # a column that is equal in all episodes (the time) is zero here, and the ridge keeps the matrix invertible
     ridge = 0.01 * count * torch.eye(x.shape[-1]).to(x)
     slope = torch.linalg.solve(x.mT @ x + ridge, x.mT @ (y - y_mean))
     fitted = y_mean + x @ slope  # (..., G, 1)
@@ -630,17 +664,17 @@ def linear_fit(x, y, alive):
 def returns_baseline(batch, gamma, group):
     """The baseline (T, N) and the scale (T, 1) of the value V(s_t) = baseline_t + scale_t * critic(s_t).
 
-    The paper has V = critic: baseline 0, scale 1. So it is here with group 1. With small noise the critic's error is
-    larger than the effect of an action. Flights of one start, compared with one another, still show that effect.
+    The paper has V = critic, which is baseline 0 and scale 1. Group 1 gives these. With small noise the critic's error
+    is larger than the effect of an action. Flights of one start, compared with one another, still show that effect.
 
     Each `group` of neighbouring episodes flew the same start. Their returns from step t on are regressed linearly on
-    their observations at step t; the fit is the baseline. What it leaves over has a spread at each step, taken over
-    all flights of all groups. scale^2 is the spread^2 of the step plus (0.3 x the mean spread of the steps)^2: without
-    the second term a step of almost no spread would be divided by almost 0.
+    their observations at step t. The fit is the baseline. Its residuals have a spread at each step, over all flights of
+    all groups. scale^2 is the spread^2 of the step plus (0.3 x the mean spread of the steps)^2. Without the second term
+    a step of almost no spread would be divided by almost 0.
 
-    RLOO (Kool et al. 2019) takes the mean return of other samples of the same question as the baseline; GRPO (Shao et
-    al. 2024) takes that of the whole group, and divides by its spread. They have one return for each sample. Here each
-    step has one, hence the regression on the state, a linear control variate.
+    RLOO (Kool et al. 2019) takes the mean return of the other samples of a question as the baseline. GRPO (Shao et al.
+    2024) takes the mean return of the whole group, and divides by the group's spread. Both have one return for each
+    sample. We have one for each step, so we regress it on the state. Such a baseline is a linear control variate.
     """
     if group == 1:
         return torch.zeros_like(batch.rewards), torch.ones_like(batch.rewards[:, :1])
@@ -652,12 +686,13 @@ def returns_baseline(batch, gamma, group):
     baseline = linear_fit(obs, grouped_returns, alive).flatten(1)
     _, variance = moments(monte_carlo - baseline, batch.alive, 1)
     mean_spread = variance.sqrt().mean()  # steps that no flight reaches count as zeros
-    return baseline, (variance + (0.3 * mean_spread) ** 2 + 1e-8).sqrt()
+    scale = (variance + (0.3 * mean_spread) ** 2 + 1e-8).sqrt()
+    return baseline, scale
 
 
 # Shared: training (Algorithm 1) and main ------------------------------------------------------------------------------
 def minibatches(args, envs, device):
-    """(epoch, minibatch, episodes) of lines 15 and 16: in each epoch every episode once, in a new order."""
+    """Yield (epoch, minibatch, episodes) of lines 15 and 16. Each epoch has every episode once, in a new order."""
     for epoch in range(1, args.update_epochs + 1):
         order = torch.randperm(envs.num_envs, device=device)
         for minibatch, mb in enumerate(order.tensor_split(args.num_minibatches), start=1):
@@ -665,9 +700,10 @@ def minibatches(args, envs, device):
 
 
 def train(args, agent, average, optimizer, envs, run, gradient=ppo_gradient):
-    """Algorithm 1, its lines beside ours. `run` counts, logs, saves and evaluates; it changes nothing that is learned.
+    """Algorithm 1, with its line numbers as comments.
 
-    Raises FloatingPointError, before the optimiser moves the weights, when a loss or the gradient is not finite.
+    `run` counts, logs, saves and evaluates. It changes nothing that is learned. Raises FloatingPointError if a loss or
+    the gradient is not finite, before the optimiser moves the weights.
     """
     target_kl = math.inf if args.target_kl is None else args.target_kl
     for iteration in range(run.updates_done + 1, args.total_updates + 1):  # line 2
@@ -701,9 +737,9 @@ def train(args, agent, average, optimizer, envs, run, gradient=ppo_gradient):
             losses = runs.finite(losses, epoch, minibatch)
             log.append(losses)
             if losses["approx_kl"] > target_kl:
-                break  # this minibatch takes no step, and ends the update
+                break  # this minibatch takes no step and ends the update
             optimizer.step()  # line 18
-            average.update_parameters(agent)  # ours: what evaluation flies
+            average.update_parameters(agent)  # ours; evaluation flies the average
 
         means = {name: torch.tensor([logged[name] for logged in log]).mean().item() for name in losses}
         means["explained_variance"] = explained_variance(batch.critic, batch.targets, batch.alive)
@@ -732,9 +768,11 @@ def main(argv):
         env_options=env_options,
         describe=describe,
     )
-    gradient = speed_up(agent, average, optimizer, ppo_gradient) if args.torch_compile else ppo_gradient
+    gradient = ppo_gradient
+    if args.torch_compile:
+        gradient = speed_up(agent, average, optimizer, ppo_gradient)
     if not args.eval_only:
-        with run:  # whatever ends the training leaves its state after the last whole update
+        with run:  # however training ends, the state after its last whole update is kept
             train(args, agent, average, optimizer, envs, run, gradient)
     run.finish()
 

@@ -2,18 +2,22 @@
 
     python ppo_gtrxl_rocket.py --seed 1                                 # the paper's 961 s, as results/rocket_fixed
     python ppo_gtrxl_rocket.py --seed 1 --env-id RocketAscentCutoff-v0  # free final time
-    python ppo_gtrxl_rocket.py --seed 1 --env-id RocketAscentCutoff-v0 --dispersion 1    # every flight another vehicle
+    python ppo_gtrxl_rocket.py --seed 1 --env-id RocketAscentCutoff-v0 --dispersion 1  # every flight another vehicle
     python ppo_gtrxl_rocket.py --seed 1 --env-id RocketAscentCutoff-v0 --dispersion 1 --failure 0.3  # half lose thrust
     python ppo_gtrxl_rocket.py --seed 1 --recipe paper                  # plain PPO with Table 1
     python ppo_gtrxl_rocket.py --eval-only --checkpoint results/rocket_fixed/agent.safetensors
 
-Top to bottom: arguments, recipes, problem, Gated Transformer-XL, agent, PPO, what we add to it, training, main.
-From the first "Shared" on, all ppo_gtrxl_*.py are the same to the letter. A section with "ours" in its heading has
-nothing from the paper; elsewhere a comment says so. T steps, N environments (Algorithm 1 calls these E, and its
-iterations N), L memory length, d width, H heads, dk = d / H.
+Reading order: arguments, recipes, problem, Gated Transformer-XL, agent, PPO, what we add to PPO, training, main.
+From the first section "Shared" on, all ppo_gtrxl_*.py are the same to the letter. A section with "ours" in its heading
+contains nothing from the paper. In the other sections a comment marks what is ours. "Line 8" means line 8 of
+Algorithm 1.
 
-The reward is R_orbital + R_trajectory + R_guidance + R_penalties + R_terminal. The paper names the five without
-formulas; ours are in rocket/rewards.py. Here R_trajectory has no weight, and R_guidance only with --guidance.
+T is the number of steps, N of environments, H of heads. L is the memory length, d the width, and dk = d / H.
+Algorithm 1 writes E for our N, and N for its iterations.
+
+The reward is R_orbital + R_trajectory + R_guidance + R_penalties + R_terminal. The paper names these five terms and
+gives no formulas. Our formulas are in rocket/rewards.py. Here R_trajectory has no weight. R_guidance counts only with
+--guidance.
 """
 
 from __future__ import annotations
@@ -41,42 +45,43 @@ from runs import Numbers, Schedule, all_reduce_sum
 
 @dataclass
 class Args:
-    """The flags. The values written here are Table 1's column of this problem: --recipe paper uses them as they are.
+    """The flags of the script. The values written here are Table 1's for this problem.
 
-    --recipe ours, the default, first replaces those in RECIPES. A flag that is typed wins over both. A Schedule is one
-    number, or points "place:value place:value ...": place 0 is the first update, 1 the last (`value_at` reads it).
+    --recipe paper uses these values. --recipe ours, the default, first replaces those that RECIPES names. A flag that
+    is typed wins over both. A Schedule is one number, or points "place:value place:value ...". Place 0 is the first
+    update, place 1 the last (`value_at`).
     """
 
     # experiment
     exp_name: str = Path(__file__).stem  # the name of this experiment
     seed: int = 1  # seed of the experiment
-    recipe: str = "ours"  # the flags that are not typed: "ours" (RECIPES, then these) or "paper" (these)
+    recipe: str = "ours"  # what the flags that are not typed are: "paper" (these values) or "ours" (RECIPES first)
     torch_deterministic: bool = True  # if toggled, `torch.backends.cudnn.deterministic=True`
     cuda: bool = True  # if toggled, a GPU is used when there is one
-    num_threads: int = 1  # CPU threads of torch (0: torch's own choice); bits depend on it
-    torch_compile: bool = False  # compile the network, on a GPU into CUDA graphs: a slow start, then quick updates
+    num_threads: int = 1  # CPU threads of torch (0: torch's own choice); the bits of the results depend on it
+    torch_compile: bool = False  # compile the network (on a GPU: CUDA graphs), for a slower start and faster updates
     track: bool = False  # if toggled, this experiment will be tracked with Weights and Biases
     wandb_project_name: str = "ppo-gtrxl"  # the wandb's project name
     wandb_entity: str | None = None  # the entity (team) of wandb's project
     capture_video: bool = False  # draw the final evaluation into the run's folder: animation.gif and the figures
     save_model: bool = True  # write checkpoints and the evaluation (off: TensorBoard events only)
     checkpoint: str | None = None  # start from these weights (.safetensors)
-    resume: str | None = None  # run folder of an interrupted run to go on with, bit for bit
+    resume: str | None = None  # go on with the interrupted run in this run folder, bit for bit
     eval_only: bool = False  # fly the mean action of --checkpoint, train nothing, write only --eval-json and --eval-npz
-    eval_starts: int | None = None  # with --dispersion or --failure: drawn flights (default 1705; 100 if cut short)
+    eval_starts: int | None = None  # number of drawn evaluation flights (default 1705; 100 in a training cut short)
     eval_seed: int = 0  # seed of the evaluation starts
     eval_json: str | None = None  # where --eval-only writes the metrics
     eval_npz: str | None = None  # where --eval-only writes the trajectories
-    eval_every: int = 5  # evaluate every so many updates, drawn flights on their own draws (0: only at the end)
+    eval_every: int = 5  # updates between two evaluations, which have their own draws (0: only at the end)
 
     # environment
     env_id: str = "RocketAscent-v0"  # the id of the environment, one of ENV_IDS
     observe_phase: bool = True  # show time and phase to the policy
-    dispersion: float = 0.0  # spread of the vehicles: 0 all are nominal; 1 each flight draws one by `envs.Dispersion`
+    dispersion: float = 0.0  # spread of the drawn vehicles, as a factor on `envs.Dispersion` (0: all are nominal)
     observe_draw: bool = False  # show the drawn vehicle to the policy, which no real flight could know
-    observe_mass: bool = False  # show the true mass of a drawn rocket, not the flight computer's
-    failure: float = 0.0  # half of the flights lose thrust, by up to this share, in one of their burns (with cut-off)
-    failure_time: str = "random"  # when: "random", or "ignition", the last stage's
+    observe_mass: bool = False  # show the true mass of a drawn rocket, not the flight computer's estimate
+    failure: float = 0.0  # half of the flights lose up to this share of thrust, in one of their burns (with cut-off)
+    failure_time: str = "random"  # when thrust is lost: at a "random" moment or at the last stage's "ignition"
     navigation_noise: Numbers = None  # standard deviations, m and m/s, of the observed position and velocity
 
     # Table 1
@@ -108,12 +113,12 @@ class Args:
     # ours: off here, on in RECIPES
     lr_times_std: bool = False  # the learning rate is --learning-rate times the policy's std
     flights_per_start: Schedule = 1  # flights of each start or draw, compared with one another
-    guidance: bool = False  # pay R_guidance: the paper's, our form of it (rocket/rewards.py)
-    mass_weight: Schedule = 0.0  # where the engine cuts off at the target's energy: factor on `mass_rewards`
+    guidance: bool = False  # pay R_guidance, which the paper names and we give a formula (rocket/rewards.py)
+    mass_weight: Schedule = 0.0  # factor on `mass_rewards`, where the engine cuts off at the target's energy
     weight_average: float = 0.0  # decay, per optimiser step, of the averaged weights used in evaluation
 
 
-# Recipes: the values that we replace (beside Table 1's: docs/decisions.md; why: docs/method.md) -----------------------
+# Recipes: the values that we replace (docs/decisions.md has Table 1's beside them, docs/method.md the reasons) --------
 OURS = {
     "num_blocks": 2,  # a laptop's network, a hundredth of Table 1's weights
     "embed_dim": 64,
@@ -129,14 +134,14 @@ OURS = {
     "clip_coef": 0.2,
     "vf_coef": 0.5,
     "target_kl": 0.02,
-    "flights_per_start": 32,  # there is one start: all flights of an update are compared
+    "flights_per_start": 32,  # there is one start, so all flights of an update are compared
 }
 CUTOFF = {
     **OURS,
     "total_updates": 380,
     "memory_noise": "0:0.01 1:0",
     "log_std": "0:-1 0.75:-5.8 1:-8",
-    "mass_weight": "0.1:0 0.2:2 0.5:2 0.85:0",  # not before the orbit is reached; at the end the orbit alone counts
+    "mass_weight": "0.1:0 0.2:2 0.5:2 0.85:0",  # zero until the orbit is reached, and at the end, for the orbit's sake
     "weight_average": 0.998,
 }
 FIXED = {
@@ -147,7 +152,7 @@ FIXED = {
     "guidance": True,
     "weight_average": 0.99,
 }
-DISPERSED = {  # replaces more, and goes on with a policy of the nominal flight
+DISPERSED = {  # replaces values of the recipe above; training begins with a policy of the nominal flight
     "total_updates": 150,
     "num_envs": 64,
     "flights_per_start": 16,
@@ -163,7 +168,7 @@ FIRST_POLICY = {  # the policy with which a dispersed training begins, by enviro
     "RocketAscentCutoff-v0": "results/rocket_cutoff/agent.safetensors",
     "TwoStageLEO-v0": "results/two_stage_leo/agent.safetensors",
 }
-FIRST_OF_FAILING = {"RocketAscentCutoff-v0": "results/rocket_dispersed/agent.safetensors"}  # the same, with failures
+FIRST_OF_FAILING = {"RocketAscentCutoff-v0": "results/rocket_dispersed/agent.safetensors"}  # the same with --failure
 
 
 def has_draws(args):
@@ -172,12 +177,18 @@ def has_draws(args):
 
 
 def recipe(args):
-    """What our recipe changes for the environments of `args`; an id without a recipe takes its family's."""
+    """What our recipe changes for the environments of `args`. An id without a recipe takes CUTOFF or FIXED.
+
+    With draws, training begins with --checkpoint or with the policy that is shipped for the id.
+    """
     family = CUTOFF if ROCKETS[args.env_id].cutoff else FIXED
     changes = RECIPES.get(args.env_id, family)
     if not has_draws(args):
         return changes
-    shipped = {**FIRST_POLICY, **(FIRST_OF_FAILING if args.failure else {})}
+
+    shipped = dict(FIRST_POLICY)
+    if args.failure:
+        shipped |= FIRST_OF_FAILING
     first_policy = args.checkpoint or shipped.get(args.env_id)
     if first_policy is None:
         flag = "--dispersion" if args.dispersion else "--failure"
@@ -192,18 +203,18 @@ ENV_IDS = tuple(ROCKETS)
 ENV_OPTIONS = (  # arguments of the environments
     "observe_phase", "dispersion", "observe_draw", "observe_mass", "failure", "failure_time", "navigation_noise",
 )  # fmt: skip
-FIXED_OPTIONS = {"action_frame": "local"}  # those that no flag sets: up, along-track, cross-track
+FIXED_OPTIONS = {"action_frame": "local"}  # arguments that no flag sets; local is up, along-track, cross-track
 BUFFERS = {env_id: policy_constants(mission.rocket) for env_id, mission in ROCKETS.items()}  # read as agent.<name>
-INITIAL_ACTION = [1.0, 0.0, 0.0]  # straight up (local frame): a randomly steered rocket never leaves the ground
+INITIAL_ACTION = [1.0, 0.0, 0.0]  # straight up (local frame), since a randomly steered rocket never leaves the ground
 OBSERVED = 9  # numbers that every rocket shows: r, v, m, t_norm, phase; the draw comes after them
-LENGTH = 64  # in 100 km: about the Earth's radius
-SPEED = 8  # in km/s: about the circular speed at that radius
+LENGTH = 64  # in 100 km, about the Earth's radius
+SPEED = 8  # in km/s, about the circular speed at that radius
 
 
 class Motion(NamedTuple):
     """Position and velocity of a flight, and what follows from them.
 
-    Unless a comment says otherwise, lengths are in Earth radii and speeds in circular speeds at that radius: mu = 1.
+    Unless a comment says otherwise, lengths are in Earth radii and speeds in circular speeds at that radius, so mu = 1.
     """
 
     r: torch.Tensor  # (..., 3) in the target orbit's axes: to the perigee, along the semi-latus rectum, normal
@@ -221,7 +232,8 @@ class Motion(NamedTuple):
 def motion(agent, obs):
     """The Motion of observations (..., 9 or more)."""
     r, v, mass = (obs[..., :7] / agent.units).split([3, 3, 1], dim=-1)
-    r, v = r @ agent.axes.T, v @ agent.axes.T
+    r = r @ agent.axes.T
+    v = v @ agent.axes.T
     radius = r.norm(dim=-1, keepdim=True)
     speed = v.norm(dim=-1, keepdim=True)
     h = torch.linalg.cross(r, v)
@@ -245,12 +257,12 @@ def features(agent, obs):
 
     - position and velocity, altitude, climb, position and speed out of the plane, speed (`Motion`)
     - the share of the time that is left, log mass, the phase one-hot
-    - the orbit's error, and tanh(10 error), in which small errors show
+    - the orbit's error, and tanh(10 error), which shows small errors
     - the draw, with --observe-draw
-    - what the flight differs by from the nominal one, in units of `differences`, clipped at 10 (tanh would flatten it);
-      zeros until the agent has a nominal flight
+    - the flight's difference from the nominal flight, in units of `differences`, clipped at 10 because tanh would
+      flatten it; zeros until the agent has a nominal flight
 
-    The paper gives the environment's observation alone: r and v in ECI, m, t_norm and the phase.
+    The paper's policy sees the environment's observation alone: r and v in ECI, m, t_norm and the phase.
     """
     m = motion(agent, obs)
     time_left, phase, draw = obs[..., 7:8], obs[..., 8:9], obs[..., OBSERVED:]
@@ -266,16 +278,16 @@ def features(agent, obs):
 
 
 def mean_action(output, action_scale):
-    """The policy's mean, a unit vector.
+    """The policy's mean: unit vectors (..., 3) along the network's output (..., 3).
 
     The environment uses only the direction of a sampled action. If the mean could grow longer, the same std would
-    change the direction less: the policy could choose its own noise.
+    change the direction less, so the policy could choose its own noise.
     """
     return F.normalize(output, dim=-1)
 
 
 def describe(episodes, metrics):
-    """What a progress line says of the sampled episodes (`final_info` arrays) and of the last evaluation, if any."""
+    """The part of a progress line about the sampled episodes (`final_info` arrays) and the last evaluation, if any."""
     line = f"return {episodes['episodic_return'].mean():7.2f}  sampled error {np.median(episodes['error_norm']):.4f}"
     if not metrics:
         return line
@@ -285,14 +297,14 @@ def describe(episodes, metrics):
 
 # Problem, ours: what only training changes ----------------------------------------------------------------------------
 def set_curriculum(envs, args, progress):
-    """Set what only training changes; returns how many flights in a row have the same start, or draw.
+    """Set what only training changes. Returns how many flights in a row have the same start or draw.
 
-    R_terminal = -2 ln(1 + error / scale): below the scale all errors earn almost the same. Noise scatters the errors of
+    R_terminal is -2 ln(1 + error / scale). Errors below the scale earn almost the same. Noise scatters the errors of
     the flights by about std / 10. So the scale falls with the noise, as std / 8, if --log-std is a schedule. It is at
-    most TERMINAL_SCALE, and at least 0.001 where flights differ (less was no better).
+    most TERMINAL_SCALE. It is at least 0.001 where flights differ, because a smaller scale is no better there.
 
-    Of failures at a random moment every second update flies those of the last stage at its ignition: the hardest to
-    save, and rare among random ones.
+    With failures at random moments, every second update flies failures of the last stage at its ignition. They are the
+    hardest to save, and rare among random ones.
     """
     envs.terminal_scale = TERMINAL_SCALE
     if isinstance(args.log_std, str):
@@ -313,8 +325,9 @@ def add_rewards(envs, args, progress, batch, episodes):
     weight = value_at(args.mass_weight, progress)
     if not envs.cutoff or weight == 0:
         return
-    all_flights = len(episodes["error"])  # of all processes
-    group = envs.flights_per_start if has_draws(args) else all_flights  # without draws all have the same start
+    group = len(episodes["error"])  # without draws all flights of all processes have the same start
+    if has_draws(args):
+        group = envs.flights_per_start
     paid = weight * mass_rewards(episodes, envs.rocket, envs.terminal_scale, group)
     paid = runs.local_shard(paid, envs.num_envs)  # the part of this process's flights
     last_step = batch.alive.sum(0).long() - 1  # (N,)
@@ -322,44 +335,51 @@ def add_rewards(envs, args, progress, batch, episodes):
     batch.rewards[last_step, flight] += torch.as_tensor(paid * args.reward_scale).to(batch.rewards)
 
 
-# Problem, ours: the nominal flight, beside which dispersed ones are seen ----------------------------------------------
+# Problem, ours: the nominal flight, from which the policy sees the differences ----------------------------------------
 def compared(m):
-    """What flights are compared by (..., 8): the orbit's error, log mass and angle of a `Motion`."""
+    """The numbers (..., 8) by which two flights are compared: the orbit's error, log mass and angle of a `Motion`."""
     return torch.cat([m.error, m.log_mass, m.angle], dim=-1)
 
 
 def nominal_at(agent, phase, energy):
-    """The nominal flight's `compared` (..., 8) at the same phase and energy as these flights, (..., 1) each.
+    """`compared` (..., 8) of the nominal flight, in the same phase (..., 1) and at the same energy (..., 1).
 
     Flights are matched by energy and not by time. Two flights with the same energy in the same burn have equally much
     energy still to gain, and what they will still add to their orbits is nearly the same. So the difference of their
     orbits now is about their difference at the end.
 
-    `nominal_flight` has one row for each step. Between two rows of a burn the values are linear in the energy; beyond
+    `nominal_flight` has one row for each step. Between two rows of a burn the values are linear in the energy. Beyond
     a burn's first or last row the nearest two rows are extrapolated. Energies are between -1 and 0 and rise within a
-    burn, so burn + energy rises over the whole flight: one sorted key finds the row. In a coast the energy stays, and
-    so does the orbit: there the coast's first row is taken.
+    burn. So burn + energy rises over the whole flight, and one sorted key finds the row. In a coast the energy and the
+    orbit stay as they are, so the coast's first row is taken.
     """
     rows = agent.nominal_flight
     burn = (phase * (len(agent.phases) - 1)).round().contiguous()
     key = (burn + energy).contiguous()
-    burns, energies = rows[:, 0].contiguous(), rows[:, 1].contiguous()  # searchsorted warns of any other layout
+    burns = rows[:, 0].contiguous()  # searchsorted warns of any other layout
+    energies = rows[:, 1].contiguous()
     first_of_burn = torch.searchsorted(burns, burn)
     last_of_burn = torch.searchsorted(burns, burn, right=True) - 1
+
     after = torch.searchsorted(burns + energies, key)  # the first row whose key is not smaller
-    after = torch.minimum(torch.maximum(after, first_of_burn + 1), last_of_burn).clamp(min=1)[..., 0]
-    share = (energy - rows[after - 1, 1:2]) / (rows[after, 1:2] - rows[after - 1, 1:2]).clamp(min=1e-7)
+    after = torch.maximum(after, first_of_burn + 1)
+    after = torch.minimum(after, last_of_burn).clamp(min=1)[..., 0]
+    row_before, row_after = rows[after - 1], rows[after]
+    share = (energy - row_before[..., 1:2]) / (row_after[..., 1:2] - row_before[..., 1:2]).clamp(min=1e-7)
+    in_burn = torch.lerp(row_before[..., 2:], row_after[..., 2:], share)
+
     begins = first_of_burn.clamp(max=len(rows) - 1)
     coasts = energies[last_of_burn] - energies[begins] < 1e-6
-    return torch.where(coasts, rows[begins[..., 0], 2:], torch.lerp(rows[after - 1, 2:], rows[after, 2:], share))
+    in_coast = rows[begins[..., 0], 2:]
+    return torch.where(coasts, in_coast, in_burn)
 
 
 @torch.no_grad()
 def before_training(agent, args, env_options):
-    """Before a dispersed training: let the policy that it begins with fly the nominal flight, and store that flight.
+    """Before a dispersed training, let its first policy fly the nominal flight, and store this flight in the agent.
 
-    The draw and the differences are new inputs to that policy. Their weights are set to 0, so at first it flies as
-    before. Before a training with failures larger differences come into sight.
+    The draw and the differences are new inputs to that policy. Their weights are set to 0, so the policy flies as
+    before at first. A training with failures begins with `widen_differences`.
     """
     begins = has_draws(args) and args.checkpoint is not None and args.resume is None and not args.eval_only
     if not begins:
@@ -376,10 +396,10 @@ def before_training(agent, args, env_options):
 
 
 def widen_differences(agent):
-    """Let a policy see differences of the orbit that are ten times as large, before they are clipped.
+    """Let a policy see ten times as large differences of the orbit before they are clipped.
 
-    The units grow, and with them the weights of what is seen in these units. So within the narrow clip the policy flies
-    as before, and beyond it goes on linearly.
+    The units of the differences grow, and the weights of these inputs grow by the same factor. So the policy flies as
+    before within the narrow clip, and its answer goes on linearly beyond it.
     """
     wide = agent.differences.new_tensor(WIDE_DIFFERENCES)
     agent.encoder[0].weight[:, -len(DIFFERENCES) :] *= wide / agent.differences
@@ -387,7 +407,7 @@ def widen_differences(agent):
 
 
 def fly_nominal(agent, policy, envs):
-    """Fly `policy(obs, t)` in one environment, and write the flight into the agent's `nominal_flight`."""
+    """Fly `policy(obs, t)` in one environment and write the flight into the agent's `nominal_flight`."""
     obs, _ = envs.reset()
     flight = [obs]
     while True:
@@ -400,14 +420,14 @@ def fly_nominal(agent, policy, envs):
     m = motion(agent, obs)
     rows = agent.nominal_flight[: len(obs)]
     rows[:, 0] = (obs[:, 8] * (len(agent.phases) - 1)).round()
-    rows[:, 1] = m.energy[:, 0].cummax(dim=0).values  # rounding alone can lower it while engines burn
+    rows[:, 1] = m.energy[:, 0].cummax(dim=0).values  # only rounding lowers the energy while engines burn
     rows[:, 2:] = compared(m)
-    agent.nominal_flight[len(obs) :, 0] = len(agent.phases)  # after its end: a burn that there is not
+    agent.nominal_flight[len(obs) :, 0] = len(agent.phases)  # rows after the flight's end belong to no burn
 
 
 # Shared: Gated Transformer-XL ("Gated Transformer-XL Implementation") -------------------------------------------------
 def linear(inputs, outputs, gain=1.0, bias=0.0):
-    """A linear layer with orthogonal weights and a constant bias (CleanRL's layer_init), or without one (None)."""
+    """A linear layer with orthogonal weights and a constant bias, as CleanRL's layer_init. None leaves the bias out."""
     layer = nn.Linear(inputs, outputs, bias=bias is not None)
     nn.init.orthogonal_(layer.weight, gain)
     if bias is not None:
@@ -416,7 +436,10 @@ def linear(inputs, outputs, gain=1.0, bias=0.0):
 
 
 class Gate(nn.Module):
-    """gate(x, y) = lambda x + (1 - lambda) y, lambda = sigmoid(W_g [x, y] + b_g); b_g > 0 begins near the identity."""
+    """gate(x, y) = lambda x + (1 - lambda) y, lambda = sigmoid(W_g [x, y] + b_g), of x and y (..., d).
+
+    With b_g > 0 an untrained gate is near the identity gate(x, y) = x.
+    """
 
     def __init__(self, embed_dim):
         super().__init__()
@@ -430,7 +453,7 @@ class Gate(nn.Module):
 class RelativeAttention(nn.Module):
     """Multi-head attention over a sliding window: A_ij = (x_i W^Q) (x_j W^K + R_{i-j})^T / sqrt(d_k), i - L <= j <= i.
 
-    R is learned, one vector for each head and distance 0..L; j runs over the memory and the episode.
+    j runs over the memory and the episode. R is learned. It has one vector for each head and each distance 0 to L.
     """
 
     def __init__(self, embed_dim, num_heads, memory_length):
@@ -454,7 +477,7 @@ class RelativeAttention(nn.Module):
         L, H, dk = self.memory_length, self.num_heads, self.dk
         chunks = math.ceil(T / max(L // 2, 64))
         C = math.ceil(T / chunks)
-        pad = (0, 0, 0, chunks * C - T)  # steps after the last, so that every chunk has C
+        pad = (0, 0, 0, chunks * C - T)  # zeros after the last step give every chunk C steps
         context = torch.cat([memory, x], dim=1)  # (N, L + T, d)
 
         q = F.pad(self.query(x) / math.sqrt(dk), pad)  # (N, chunks * C, d)
@@ -471,12 +494,13 @@ class RelativeAttention(nn.Module):
         return self.out(attended[:, :T])
 
     def position_scores(self, q):
-        """q_i R_{i-j}^T of q (N, chunks, H, C, dk) for all keys of its window: (..., C, L + C), -inf out of reach.
+        """q_i R_{i-j}^T of q (N, chunks, H, C, dk) for all keys j of its window: (N, chunks, H, C, L + C).
 
-        Key i + L of a window is query i itself, so query i reaches the keys i to i + L. `products` has a row for each
-        query and a column for each distance, L first: row i has to move right by i. One reshape does it: pad each row
-        with C columns of -inf, join the rows to one line, and cut that into rows which are one column shorter. For
-        L = 2, C = 3 (a2: query a at distance 2; ".": -inf):
+        Key i + L of a window is query i itself, so query i reaches the keys i to i + L. All other keys get -inf.
+
+        `products` has a row for each query and a column for each distance, L first. Row i has to move right by i. One
+        reshape moves all rows: pad each row with C columns of -inf, join the rows to one line, and cut this line into
+        rows that are one column shorter. Here L = 2 and C = 3; a2 is query a at distance 2, and "." is -inf:
 
             a2 a1 a0 .  .  .        a2 a1 a0 .  .
             b2 b1 b0 .  .  .   ->   .  b2 b1 b0 .
@@ -488,11 +512,11 @@ class RelativeAttention(nn.Module):
         return line[..., : C * (L + C)].unflatten(-1, (C, L + C))
 
     def start_cache(self, memory, steps):
-        """What `step` needs, for episodes of at most `steps` steps with the memory (N, L, d):
+        """The cache of `step`, for episodes of at most `steps` steps that begin with the memory (N, L, d):
 
-        - kv (2, N, H, L + steps, dk), keys and values: the memory's, then room for those of the steps
-        - the projections W^Q / sqrt(dk), W^K and W^V as one matrix (3 d, d)
-        - R (H, L + 1, dk), distance L first, as the window's keys are ordered
+        - kv (2, N, H, L + steps, dk): keys and values of the memory, then room for those of the steps
+        - projections (3 d, d): W^Q / sqrt(dk), W^K and W^V as one matrix
+        - R (H, L + 1, dk): distance L first, which is the order of the window's keys
         """
         kv = torch.stack([self.key(memory), self.value(memory)])  # (2, N, L, d)
         kv = kv.unflatten(-1, (self.num_heads, self.dk)).transpose(2, 3)  # (2, N, H, L, dk)
@@ -501,7 +525,10 @@ class RelativeAttention(nn.Module):
         return kv, projections, self.R.flip(1)
 
     def step(self, x, cache, t):
-        """Step t alone: x (N, d) -> (N, d); writes its key and value into the cache, reads the window before it."""
+        """MultiHead(x) of step t alone: x (N, d) -> (N, d).
+
+        It writes the step's key and value into the cache. Then it attends to the window that ends with them.
+        """
         kv, projections, R = cache
         L = self.memory_length
         qkv = F.linear(x, projections)  # (N, 3 d)
@@ -526,7 +553,7 @@ class GTrXLBlock(nn.Module):
         self.mlp = nn.Sequential(linear(embed_dim, mlp_dim), nn.GELU(), linear(mlp_dim, embed_dim))
 
     def forward(self, x, attended):
-        """x is the block's input, `attended` its MultiHead(x), of the whole segment or of one step."""
+        """h2 of the block's input x and `attended`, its MultiHead(x): (..., d) each, whole episodes or one step."""
         h1 = self.gate1(x, self.norm1(x + attended))
         return self.gate2(h1, self.norm2(h1 + self.mlp(h1)))
 
@@ -536,12 +563,13 @@ LOG_STD_RANGE = (-8.0, 0.5)
 
 
 class Agent(nn.Module):
-    """Actor and critic on one GTrXL trunk. The Gaussian policy has one log-std for all states, learned or set.
+    """Actor and critic on one GTrXL trunk. The policy is Gaussian, with one log-std for all states, learned or set.
 
-    A block's memory at step t is what the block received at the steps t - L to t - 1, and m_0 before the first step.
-    A rollout stores it as keys and values (`encode_step`). Training stores only m_0, and computes the whole episode
-    again from it with the current weights (`encode`); so gradients flow through the memory. This replaces lines 10, 11
-    and 17. Line 10 also stores the action a_t. We leave it out: two states that are fully observed tell the action.
+    A block's memory at step t is what the block received at the steps t - L to t - 1. Before the first step it is m_0.
+    A rollout stores the memory as keys and values (`encode_step`). Training stores only m_0. It computes the whole
+    episode again from m_0 with the current weights (`encode`), so gradients flow through the memory. This replaces
+    lines 10, 11 and 17. Line 10 also stores the action a_t. We leave the action out, because two fully observed states
+    in a row tell which action lay between them.
     """
 
     def __init__(self, args, envs):
@@ -565,13 +593,15 @@ class Agent(nn.Module):
         self.actor = nn.Sequential(linear(d, hidden, gain=2**0.5), nn.GELU(), linear(hidden, actions, gain=0.01))
         self.actor[-1].bias.data[:] = torch.tensor(INITIAL_ACTION)
         self.critic = nn.Sequential(linear(d, hidden, gain=2**0.5), nn.GELU(), linear(hidden, 1))
-        learned = not isinstance(args.log_std, str)  # a number: learned from there; points: set by them
+        learned = not isinstance(args.log_std, str)  # a number is where learning begins; points are set
         self.actor_logstd = nn.Parameter(torch.full((actions,), value_at(args.log_std, 0.0)), requires_grad=learned)
 
     def new_memory(self, num_envs, noise):
         """m_0 ~ N(0, noise^2), drawn once per episode and block: (blocks, N, L, d)."""
         zeros = self.actor_logstd.new_zeros(self.num_blocks, num_envs, self.memory_length, self.embed_dim)
-        return zeros.normal_(std=noise) if noise else zeros  # without noise nothing is drawn
+        if not noise:
+            return zeros  # nothing is drawn
+        return zeros.normal_(std=noise)
 
     def encode(self, obs, memory):
         """Whole episodes in parallel (training): obs (N, T, obs), memory (blocks, N, L, d) -> hidden (N, T, d)."""
@@ -586,18 +616,18 @@ class Agent(nn.Module):
         return [block.attention.start_cache(m, steps) for block, m in zip(self.blocks, memory)]
 
     def encode_step(self, obs, cache, t):
-        """Step t of the same episodes (rollout): obs (N, obs) -> hidden (N, d); its cost does not grow with t."""
+        """Step t of the same episodes (rollout): obs (N, obs) -> hidden (N, d). The cost does not grow with t."""
         x = self.encoder(features(self, obs))
         for block, block_cache in zip(self.blocks, cache):
             x = block(x, block.attention.step(x, block_cache, t))
         return x
 
     def get_mean_action(self, hidden):
-        """What evaluation flies: the policy without its noise."""
+        """The policy without its noise, which evaluation flies: actions (..., actions) of hidden (..., d)."""
         return mean_action(self.actor(hidden), self.action_scale)
 
     def get_policy(self, hidden):
-        """The Gaussian that training samples from, of hidden (..., d): over actions (..., actions), in their unit."""
+        """The Gaussian that training samples from: over actions (..., actions) in their unit, of hidden (..., d)."""
         mean = self.get_mean_action(hidden)
         std = self.actor_logstd.clamp(*LOG_STD_RANGE).exp()
         return Normal(mean, std.expand_as(mean), validate_args=False)
@@ -605,10 +635,11 @@ class Agent(nn.Module):
     def act(self, obs, cache, t):
         """Step t of a rollout: hidden (N, d) and sampled actions (N, actions) of obs (N, obs)."""
         hidden = self.encode_step(obs, cache, t)  # lines 7 and 10
-        return hidden, self.get_policy(hidden).rsample()  # line 8; a GPU would be waited for by `sample`
+        actions = self.get_policy(hidden).rsample()  # line 8; `sample` would wait for a GPU
+        return hidden, actions
 
     def evaluate_actions(self, hidden, actions):
-        """log pi(a|s), entropy and critic's output, (...) each, of hidden (..., d) and actions (..., actions)."""
+        """log pi(a|s), entropy and the critic's output, (...) each, of hidden (..., d) and actions (..., actions)."""
         probs = self.get_policy(hidden)
         logprob = probs.log_prob(actions).sum(-1)
         entropy = probs.entropy().sum(-1)
@@ -616,9 +647,9 @@ class Agent(nn.Module):
         return logprob, entropy, value
 
     def make_policy(self, steps):
-        """The function policy(obs (N, obs), t) -> mean actions (N, actions), in NumPy, that evaluation flies.
+        """The function that evaluation flies: policy(obs (N, obs), t) -> mean actions (N, actions), in NumPy.
 
-        At t = 0 it begins new episodes, with a memory of zeros.
+        A call with t = 0 begins new episodes, of at most `steps` steps, with a memory of zeros.
         """
         dtype, device = self.actor_logstd.dtype, self.actor_logstd.device
         cache = []
@@ -636,22 +667,25 @@ class Agent(nn.Module):
 # Shared: PPO (Algorithm 1) --------------------------------------------------------------------------------------------
 @dataclass
 class Batch:
-    """The episodes of one update; `alive` is 1 up to an episode's last step, 0 after it."""
+    """The episodes of one update. `alive` is 1 up to an episode's last step and 0 after it."""
 
     obs: torch.Tensor  # (T, N, obs)
     actions: torch.Tensor  # (T, N, actions)
     logprobs: torch.Tensor  # (T, N)
     rewards: torch.Tensor  # (T, N), scaled
-    critic: torch.Tensor  # (T, N), its output; V of `returns_baseline` is made of it
+    critic: torch.Tensor  # (T, N), the critic's output, from which `returns_baseline` makes V
     alive: torch.Tensor  # (T, N)
     memory: torch.Tensor  # (blocks, N, L, d), m_0
     advantages: torch.Tensor | None = None  # (T, N), set by train
-    targets: torch.Tensor | None = None  # (T, N), set by train: what the critic learns
+    targets: torch.Tensor | None = None  # (T, N), set by train; the critic learns them
 
 
 @torch.no_grad()
 def rollout(agent, envs, reward_scale, memory_noise):
-    """Fly one episode in each environment (lines 3-13): this process's Batch, and all processes' `final_info`."""
+    """Fly one episode in each environment (lines 3-13).
+
+    Returns this process's Batch, and {key: (episodes, ...)} of `final_info` for the episodes of all processes.
+    """
     T, N = envs.episode_steps, envs.num_envs
     zeros = agent.actor_logstd.new_zeros  # on the agent's device, in its precision
     batch = Batch(
@@ -670,26 +704,26 @@ def rollout(agent, envs, reward_scale, memory_noise):
     alive = np.ones(N, dtype=bool)
     episodes = {}  # `final_info` of each environment's first episode
     next_obs, _ = envs.reset()
-    batch.obs[:] = torch.as_tensor(next_obs)  # after the last episode's end: features of zeros could be NaN
+    batch.obs[:] = torch.as_tensor(next_obs)  # no step stays zero: the features of zeros could be NaN
 
     for t in range(T):  # line 6
         batch.obs[t] = torch.as_tensor(next_obs)
         alive_at[t] = alive
         hidden[t], batch.actions[t] = agent.act(batch.obs[t], cache, t)  # lines 7, 8 and 10
-        # line 9; an episode's end is a true end: V is 0 there, and nothing is ever truncated
+        # line 9. The end of an episode is a true end, where V is 0: nothing is ever truncated.
         next_obs, reward, terminated, _, info = envs.step(batch.actions[t].cpu().numpy())
         rewards[t] = reward * alive * reward_scale
         ended = alive & terminated
         for key, value in info.get("final_info", {}).items():
             first_episodes = episodes.setdefault(key, np.zeros_like(value))
             first_episodes[ended] = value[ended]
-        alive = alive & ~terminated  # an ended environment has started anew; only its first episode counts
+        alive = alive & ~terminated  # an ended environment starts a new episode, which does not count
         if not alive.any():
             break
 
     batch.rewards[:] = torch.as_tensor(rewards)
     batch.alive[:] = torch.as_tensor(alive_at)
-    # v_t of line 8 and log pi(a_t), for all steps in one call: sampling needs neither
+    # v_t of line 8 and log pi(a_t). Sampling needs neither, so one call computes them for all steps.
     batch.logprobs, _, batch.critic = agent.evaluate_actions(hidden, batch.actions)
     of_each_process = runs.all_gather(episodes)
     all_episodes = {key: np.concatenate([part[key] for part in of_each_process]) for key in episodes}
@@ -697,11 +731,15 @@ def rollout(agent, envs, reward_scale, memory_noise):
 
 
 def gae(rewards, values, alive, gamma, gae_lambda):
-    """A_t = sum_l (gamma lambda)^l delta_{t+l} and the returns A + V, all (T, N); V is 0 beyond an episode's end."""
+    """Advantages A_t = sum_l (gamma lambda)^l delta_{t+l} and returns A_t + V_t, all (T, N).
+
+    delta_t = r_t + gamma V_{t+1} - V_t, where V is 0 beyond an episode's end.
+    """
     device = rewards.device
-    rewards, values, alive = rewards.cpu(), values.cpu(), alive.cpu()  # a GPU would take longer: T small steps
+    rewards, values, alive = rewards.cpu(), values.cpu(), alive.cpu()  # a GPU is slower at T small steps
     advantages = torch.zeros_like(rewards)
-    lastgaelam = next_value = torch.zeros_like(values[0])
+    lastgaelam = torch.zeros_like(values[0])
+    next_value = torch.zeros_like(values[0])
     for t in reversed(range(len(rewards))):
         delta = rewards[t] + gamma * next_value - values[t]
         lastgaelam = (delta + gamma * gae_lambda * lastgaelam) * alive[t]
@@ -711,7 +749,7 @@ def gae(rewards, values, alive, gamma, gae_lambda):
 
 
 def moments(x, alive, dim):
-    """Mean and variance along dim of the living steps of every process."""
+    """Mean and variance of x along dim, over the living steps of all processes. `dim` is kept with length 1."""
     count = all_reduce_sum(alive.sum(dim, keepdim=True)).clamp(min=1)
     mean = all_reduce_sum((x * alive).sum(dim, keepdim=True)) / count
     variance = all_reduce_sum(((x - mean) ** 2 * alive).sum(dim, keepdim=True)) / count
@@ -719,17 +757,18 @@ def moments(x, alive, dim):
 
 
 def explained_variance(prediction, returns, alive):
-    """1 - Var(returns - prediction) / Var(returns) over the living steps, as CleanRL's."""
-    _, left = moments(returns - prediction, alive, (0, 1))
-    _, all_of_it = moments(returns, alive, (0, 1))
-    return (1 - left / all_of_it).item()
+    """1 - Var(returns - prediction) / Var(returns) over the living steps of (T, N), as in CleanRL."""
+    _, unexplained = moments(returns - prediction, alive, (0, 1))
+    _, total = moments(returns, alive, (0, 1))
+    return (1 - unexplained / total).item()
 
 
 def ppo_loss(agent, batch, mb, clip_coef, vf_coef, ent_coef):
-    """-L_CLIP + c1 L_VF - c2 H over the living steps of the episodes `mb`; returns it and what is logged.
+    """The loss -L_CLIP + c1 L_VF - c2 H over the living steps of the episodes `mb`, and the means that are logged.
 
-    The paper's sum with the sign that raises L_CLIP, and L_VF = 1/2 (critic - target)^2. Under torchrun the loss is
-    this process's part of the mean (the gradients are then summed), what is logged is of all.
+    The paper prints L_CLIP + c1 L_VF - c2 H. Our sign of L_CLIP raises it where the loss is minimised. L_VF is
+    1/2 (critic - target)^2. Under torchrun the loss is this process's part of the mean, and `ppo_gradient` sums the
+    gradients. What is logged is the mean over all processes.
     """
     alive = batch.alive[:, mb]
     advantages = batch.advantages[:, mb]
@@ -763,20 +802,24 @@ def ppo_loss(agent, batch, mb, clip_coef, vf_coef, ent_coef):
 
 
 def ppo_gradient(args, agent, batch, mb, ent_coef):
-    """Set the parameters' `.grad` to the gradient of `ppo_loss`, clipped; returns what is logged, with its norm."""
+    """Set the parameters' `.grad` to the clipped gradient of `ppo_loss`.
+
+    Returns what is logged, with the norm that the gradient had before it was clipped.
+    """
     loss, losses = ppo_loss(agent, batch, mb, args.clip_coef, args.vf_coef, ent_coef)
     agent.zero_grad()
     loss.backward()
-    runs.sum_gradients(agent)  # over torchrun's processes
+    runs.sum_gradients(agent)  # over the processes of torchrun
     losses["gradient_norm"] = nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
     return losses
 
 
 # Shared, ours: what we add to PPO -------------------------------------------------------------------------------------
 def value_at(schedule, progress):
-    """The value of "0:-1 0.4:-2 1:-6" at `progress`, 0 in the first update and 1 in the last; a number is constant.
+    """The value of a schedule at `progress`, which is 0 in the first update and 1 in the last.
 
-    Linear between the points; of two points at one place the second counts from there on.
+    A number is constant. Points "0:-1 0.4:-2 1:-6" are joined by lines. If two points have one place, the second counts
+    from there on.
     """
     if not isinstance(schedule, str):
         return schedule
@@ -787,7 +830,7 @@ def value_at(schedule, progress):
 
 
 def set_log_std(agent, args, progress):
-    """Set the log-std of this update if --log-std is a schedule; clamp it if it is learned.
+    """Set the log-std of this update if --log-std is a schedule. Clamp it if it is learned.
 
     Beyond LOG_STD_RANGE the clamp in `get_policy` has no gradient, so a learned log-std would never come back.
     """
@@ -798,7 +841,7 @@ def set_log_std(agent, args, progress):
 
 
 def learning_rate_of(agent, args, progress):
-    """The learning rate of this update; with --lr-times-std it is multiplied by the policy's standard deviation.
+    """The learning rate of this update. With --lr-times-std it is multiplied by the policy's standard deviation.
 
     Two policies whose means differ by delta have the KL divergence delta^2 / (2 std^2). A step of Adam moves each
     weight by about the learning rate, so it moves the mean by an amount in proportion to the learning rate. If the
@@ -812,21 +855,26 @@ def learning_rate_of(agent, args, progress):
 
 
 def linear_fit(x, y, alive):
-    """The value that a linear regression predicts for y (..., G) from x (..., G, k), over a group's G episodes.
+    """The values (..., G) that a linear regression of y (..., G) on x (..., G, k) predicts, over a group's G episodes.
 
     Only living episodes count. The regression has a small ridge penalty. An episode's own return is part of its fit.
     So its residual is smaller by the factor 1 - leverage, and an episode in an extreme state counts less. The leverage
     depends on the states of this step and not on the action. So with --gae-lambda 1 the expected policy gradient of a
-    state keeps its direction; below 1 this holds only approximately. Fits that leave the episode out were worse:
-    docs/archive.md.
+    state keeps its direction. Below 1 this holds only approximately. Fits that leave the episode out are worse
+    (docs/archive.md).
     """
-    x, y = x.double(), y.double()[..., None]
+    x = x.double()
+    y = y.double()[..., None]  # (..., G, 1)
     weight = alive.double()[..., None]  # (..., G, 1)
     count = weight.sum(-2, keepdim=True).clamp(min=1)  # (..., 1, 1)
+
+    x_mean = (x * weight).sum(-2, keepdim=True) / count
     y_mean = (y * weight).sum(-2, keepdim=True) / count
-    x = (x - (x * weight).sum(-2, keepdim=True) / count) * weight  # centred
-    x = x / ((x * x).sum(-2, keepdim=True) / count).sqrt().add(1e-6)  # of unit spread
-    # a column that is equal in all episodes (the time) is zero here; the ridge keeps the matrix invertible
+    x = (x - x_mean) * weight
+    spread = ((x * x).sum(-2, keepdim=True) / count).sqrt()
+    x = x / spread.add(1e-6)
+
+    # a column that is equal in all episodes (the time) is zero here, and the ridge keeps the matrix invertible
     ridge = 0.01 * count * torch.eye(x.shape[-1]).to(x)
     slope = torch.linalg.solve(x.mT @ x + ridge, x.mT @ (y - y_mean))
     fitted = y_mean + x @ slope  # (..., G, 1)
@@ -836,17 +884,17 @@ def linear_fit(x, y, alive):
 def returns_baseline(batch, gamma, group):
     """The baseline (T, N) and the scale (T, 1) of the value V(s_t) = baseline_t + scale_t * critic(s_t).
 
-    The paper has V = critic: baseline 0, scale 1. So it is here with group 1. With small noise the critic's error is
-    larger than the effect of an action. Flights of one start, compared with one another, still show that effect.
+    The paper has V = critic, which is baseline 0 and scale 1. Group 1 gives these. With small noise the critic's error
+    is larger than the effect of an action. Flights of one start, compared with one another, still show that effect.
 
     Each `group` of neighbouring episodes flew the same start. Their returns from step t on are regressed linearly on
-    their observations at step t; the fit is the baseline. What it leaves over has a spread at each step, taken over
-    all flights of all groups. scale^2 is the spread^2 of the step plus (0.3 x the mean spread of the steps)^2: without
-    the second term a step of almost no spread would be divided by almost 0.
+    their observations at step t. The fit is the baseline. Its residuals have a spread at each step, over all flights of
+    all groups. scale^2 is the spread^2 of the step plus (0.3 x the mean spread of the steps)^2. Without the second term
+    a step of almost no spread would be divided by almost 0.
 
-    RLOO (Kool et al. 2019) takes the mean return of other samples of the same question as the baseline; GRPO (Shao et
-    al. 2024) takes that of the whole group, and divides by its spread. They have one return for each sample. Here each
-    step has one, hence the regression on the state, a linear control variate.
+    RLOO (Kool et al. 2019) takes the mean return of the other samples of a question as the baseline. GRPO (Shao et al.
+    2024) takes the mean return of the whole group, and divides by the group's spread. Both have one return for each
+    sample. We have one for each step, so we regress it on the state. Such a baseline is a linear control variate.
     """
     if group == 1:
         return torch.zeros_like(batch.rewards), torch.ones_like(batch.rewards[:, :1])
@@ -858,12 +906,13 @@ def returns_baseline(batch, gamma, group):
     baseline = linear_fit(obs, grouped_returns, alive).flatten(1)
     _, variance = moments(monte_carlo - baseline, batch.alive, 1)
     mean_spread = variance.sqrt().mean()  # steps that no flight reaches count as zeros
-    return baseline, (variance + (0.3 * mean_spread) ** 2 + 1e-8).sqrt()
+    scale = (variance + (0.3 * mean_spread) ** 2 + 1e-8).sqrt()
+    return baseline, scale
 
 
 # Shared: training (Algorithm 1) and main ------------------------------------------------------------------------------
 def minibatches(args, envs, device):
-    """(epoch, minibatch, episodes) of lines 15 and 16: in each epoch every episode once, in a new order."""
+    """Yield (epoch, minibatch, episodes) of lines 15 and 16. Each epoch has every episode once, in a new order."""
     for epoch in range(1, args.update_epochs + 1):
         order = torch.randperm(envs.num_envs, device=device)
         for minibatch, mb in enumerate(order.tensor_split(args.num_minibatches), start=1):
@@ -871,9 +920,10 @@ def minibatches(args, envs, device):
 
 
 def train(args, agent, average, optimizer, envs, run, gradient=ppo_gradient):
-    """Algorithm 1, its lines beside ours. `run` counts, logs, saves and evaluates; it changes nothing that is learned.
+    """Algorithm 1, with its line numbers as comments.
 
-    Raises FloatingPointError, before the optimiser moves the weights, when a loss or the gradient is not finite.
+    `run` counts, logs, saves and evaluates. It changes nothing that is learned. Raises FloatingPointError if a loss or
+    the gradient is not finite, before the optimiser moves the weights.
     """
     target_kl = math.inf if args.target_kl is None else args.target_kl
     for iteration in range(run.updates_done + 1, args.total_updates + 1):  # line 2
@@ -907,9 +957,9 @@ def train(args, agent, average, optimizer, envs, run, gradient=ppo_gradient):
             losses = runs.finite(losses, epoch, minibatch)
             log.append(losses)
             if losses["approx_kl"] > target_kl:
-                break  # this minibatch takes no step, and ends the update
+                break  # this minibatch takes no step and ends the update
             optimizer.step()  # line 18
-            average.update_parameters(agent)  # ours: what evaluation flies
+            average.update_parameters(agent)  # ours; evaluation flies the average
 
         means = {name: torch.tensor([logged[name] for logged in log]).mean().item() for name in losses}
         means["explained_variance"] = explained_variance(batch.critic, batch.targets, batch.alive)
@@ -938,9 +988,11 @@ def main(argv):
         env_options=env_options,
         describe=describe,
     )
-    gradient = speed_up(agent, average, optimizer, ppo_gradient) if args.torch_compile else ppo_gradient
+    gradient = ppo_gradient
+    if args.torch_compile:
+        gradient = speed_up(agent, average, optimizer, ppo_gradient)
     if not args.eval_only:
-        with run:  # whatever ends the training leaves its state after the last whole update
+        with run:  # however training ends, the state after its last whole update is kept
             train(args, agent, average, optimizer, envs, run, gradient)
     run.finish()
 

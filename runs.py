@@ -1,6 +1,7 @@
-"""What surrounds the learning in the ppo_gtrxl_*.py scripts: arguments, a run's files and messages, memory, processes.
+"""What surrounds the learning in the ppo_gtrxl_*.py scripts.
 
-Bad input ends with one line and exit status 1.
+Reading order: arguments, start of a script, a run with its files and messages, checkpoints, memory, processes. Bad
+input ends a script with one line and exit status 1.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ from common.evaluations import write_evaluation
 from common.tasks import Task, task_of
 from common.tasks import env_ids as known_ids
 
-gc.freeze()  # what was imported is never garbage; looking through it took a fifth of the time of --help
+gc.freeze()  # imported modules are never garbage, and looking through them takes a fifth of the time of --help
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Arguments
@@ -49,7 +50,10 @@ gc.freeze()  # what was imported is never garbage; looking through it took a fif
 
 
 def schedule_of(words):
-    """A flag's words: one number, or points "0:-1 0.4:-2 1:-6" over the training. ValueError where they are neither."""
+    """The schedule that a flag's words give: one number, or points "0:-1 0.4:-2 1:-6" as one string.
+
+    Raises ValueError if they are neither.
+    """
     if len(words) > 1 or ":" in "".join(words):
         return " ".join(words)
     if not words:
@@ -78,7 +82,7 @@ Numbers = Annotated[
         str_from_instance=lambda value: [str(number) for number in value or ()],
     ),
 ]
-RANGES = {  # lowest and highest value of every numeric flag; NaN and infinity are outside
+RANGES = {  # lowest and highest value of every numeric flag; NaN and infinity are out of range
     **dict.fromkeys(["seed", "eval_seed", "num_threads", "eval_every"], (0, 2**31 - 1)),
     **dict.fromkeys(["total_updates", "num_envs", "num_minibatches", "update_epochs"], (1, 10**6)),
     **dict.fromkeys(["embed_dim", "num_heads", "mlp_dim", "hidden_dim"], (1, 8192)),
@@ -95,9 +99,10 @@ RANGES = {  # lowest and highest value of every numeric flag; NaN and infinity a
 }
 RECIPE_WORDS = ("ours", "paper")
 NETWORK = ("num_blocks", "embed_dim", "num_heads", "memory_length", "mlp_dim", "hidden_dim")
-# options of the environment: chosen anew for each run and evaluation
+# environment options that every run and evaluation chooses anew
 NOT_OF_A_CHECKPOINT = {"dispersion", "failure", "navigation_noise"}
-MAY_DIFFER_FROM_A_CHECKPOINT = {"failure_probability", "failure_size", "failure_time"}  # else they are the file's
+# environment options that a checkpoint decides unless they are typed
+MAY_DIFFER_FROM_A_CHECKPOINT = {"failure_probability", "failure_size", "failure_time"}
 CHANGED_BY_TRAINING = {"differences"}  # constants of an agent that a training may set anew
 MAY_CHANGE_ON_RESUME = {"resume", "cuda", "num_threads"}
 
@@ -108,16 +113,16 @@ def fail(message) -> NoReturn:
 
 
 def refuse(name, value, allowed) -> NoReturn:
-    """End with one line that names a field of Args as its flag, its value and what is allowed."""
+    """End with one line that names the flag of an Args field, its value and what is allowed."""
     flag = f"--{name.replace('_', '-')} {value}".strip()
     fail(f"{flag}: {allowed}")
 
 
 def read_flags(defaults, argv):
-    """The dataclass that a command line describes, and the set of fields that it names; `defaults` has the others.
+    """The dataclass that a command line describes, and the set of fields that it names. `defaults` has the others.
 
-    tyro alone knows which flags there are and what they take, but neither which of them were typed nor how to complain
-    in one line: the names are read from `argv`, and of its framed message the first paragraph is shown.
+    tyro knows which flags there are and what they take. It does not tell which flags were typed, so we read their names
+    from `argv`. It complains in a frame of several lines, so we show the frame's first paragraph as one line.
     """
     with contextlib.redirect_stderr(io.StringIO()) as frame:
         try:
@@ -125,27 +130,31 @@ def read_flags(defaults, argv):
         except SystemExit as stop:
             if not stop.code:  # --help
                 raise
-            lines = (line.strip("│ ") for line in frame.getvalue().splitlines() if line[:1] != "╭")
-            first = " ".join(takewhile(lambda line: line[:1] not in ("─", "╰"), lines))
-            fail(f"{first} (--help lists what is allowed)")
-    words = [word.split("=")[0] for word in argv if word.startswith("--")]
-    return args, {word.removeprefix("--").replace("-", "_").removeprefix("no_") for word in words}
+            lines = [line.strip("│ ") for line in frame.getvalue().splitlines() if line[:1] != "╭"]
+            first_paragraph = takewhile(lambda line: line[:1] not in ("─", "╰"), lines)
+            fail(f"{' '.join(first_paragraph)} (--help lists what is allowed)")
+    flags = [word.split("=")[0] for word in argv if word.startswith("--")]
+    names = [flag.removeprefix("--").replace("-", "_") for flag in flags]
+    return args, {name.removeprefix("no_") for name in names}
 
 
 def allowed(args):
-    """What --help says of the numbers: each flag with its range."""
+    """The line of --help that gives the range of each numeric flag."""
     ranges = {name: bounds for name, bounds in RANGES.items() if hasattr(args, name)}
     flags = (f"--{name.replace('_', '-')} {low:g} to {high:g}" for name, (low, high) in ranges.items())
     return f"Ranges: {', '.join(flags)}"
 
 
 def parse_args(kind, recipe, argv, env_options, buffers):
-    """A script's checked arguments; with --resume the saved training state, with a checkpoint what that file holds.
+    """A script's checked arguments, and what it begins with: a saved training state, a checkpoint's contents or None.
 
-    kind is the script's Args, `recipe(args)` what its recipe changes for these environments, env_options the arguments
-    that go to its environments, buffers what its agents hold by environment id. What was typed wins over what a
-    checkpoint decides, that over the recipe, and that over Args. SystemExit with one line that names the flag, the
-    value and what is allowed.
+    - kind: the script's Args
+    - recipe: the function recipe(args) -> what the recipe changes for these environments
+    - env_options: names of the arguments that go to the environments
+    - buffers: {environment id: the buffers of its agents}
+
+    A typed flag wins over a checkpoint, a checkpoint over the recipe, and the recipe over Args. Raises SystemExit with
+    one line that names the flag, the value and what is allowed.
     """
     asks_for_help = not {"-h", "--help"}.isdisjoint(argv)
     typed_args, typed = read_flags(kind(), [word for word in argv if word not in ("-h", "--help")])
@@ -163,21 +172,24 @@ def parse_args(kind, recipe, argv, env_options, buffers):
     check(args, env_ids)
     check_buffers(args, buffers[args.env_id])
     task = task_of(args.env_id)
-    if unfit := task.refusal(not args.eval_only, **options_of(args, env_options)):
+    options = options_of(args, env_options)
+    unfit = task.refusal(not args.eval_only, **options)
+    if unfit:
         name, why = unfit
         refuse(name, getattr(args, name, ""), why)
     check_share(args, typed)
     if args.eval_only and saved and saved["progress"]["seed"] == args.eval_seed:
-        if remark := task.remark_on_seed(args.eval_seed):
+        remark = task.remark_on_seed(args.eval_seed)
+        if remark:
             print(remark)
     if args.eval_starts is None:
         is_cut_short = not args.eval_only and args.total_updates < defaults.total_updates
-        args.eval_starts = task.default_flights(is_cut_short, **options_of(args, env_options))
+        args.eval_starts = task.default_flights(is_cut_short, **options)
     return args, saved
 
 
 def resolve(args, typed, kind, recipe, env_options, buffers):
-    """Args with all that was not typed as the checkpoint and the recipe have it; and what the checkpoint holds."""
+    """Args as they are without the typed flags: the checkpoint's, then the recipe's; and what the checkpoint holds."""
     saved = None
     decided = {}
     if args.checkpoint is not None:
@@ -206,40 +218,44 @@ def resolve(args, typed, kind, recipe, env_options, buffers):
 
 
 def observation_scale(env_id):
-    """The constant of an agent by which `features` divides observations: the environment's."""
+    """The buffer by which `features` divides observations, from the environment."""
     return {"observation_scale": make_batch(env_id, 1).observation_scale.tolist()}
 
 
 def options_of(args, env_options):
-    """The keywords of the environments, from the arguments of these names."""
+    """The keyword arguments of the environments: {name: value} of the `args` that `env_options` names."""
     return {name: getattr(args, name) for name in env_options}
 
 
 def read_policy(path, kind, env_options, buffers):
-    """What an agent.safetensors holds, and the arguments that it decides. BadInput where it is damaged or foreign."""
+    """What an agent.safetensors holds, and the arguments that it decides.
+
+    Raises BadInput if the file is damaged or of another script.
+    """
     options = [name for name in env_options if name not in NOT_OF_A_CHECKPOINT]
     names = ("env_id", *options, *NETWORK)
     kinds = {name: type(getattr(kind, name)) for name in names}
-    younger = {name: getattr(kind, name) for name in options}  # perhaps than the file
+    younger = {name: getattr(kind, name) for name in options}  # options that an older file does not have
     saved = read_checkpoint(path, kinds, tuple(buffers), younger)
     return saved, {name: saved["args"][name] for name in names}
 
 
 def contradictions(args, typed, decided):
-    """The fields that were typed and are not as a checkpoint decides them."""
+    """The typed fields that differ from what a checkpoint decides."""
     fixed = {name: value for name, value in decided.items() if name not in MAY_DIFFER_FROM_A_CHECKPOINT}
     return [name for name, value in fixed.items() if name in typed and getattr(args, name) != value]
 
 
 def take_checkpoint_args(args, kind, typed, env_options, buffers):
-    """What the file --checkpoint holds, and the arguments that it decides; sets these, refuses flags that contradict.
+    """What the file --checkpoint holds, and the arguments that it decides.
 
-    Its environment may be another with the same buffers. A noise that is learned goes on from the file's, unless a flag
-    says otherwise.
+    Sets these arguments, and refuses flags that contradict them. --env-id may name another environment with the same
+    buffers. A learned log-std goes on from the file's, unless --log-std is typed.
     """
     saved, decided = read_policy(args.checkpoint, kind, env_options, buffers)
     for name in contradictions(args, typed, decided):
-        value, given = decided[name], getattr(args, name)
+        value = decided[name]
+        given = getattr(args, name)
         if name == "env_id" and buffers.get(value) == buffers.get(given):
             print(f"--checkpoint is of {value}; it goes on with {given}")
             decided[name] = given
@@ -253,10 +269,10 @@ def take_checkpoint_args(args, kind, typed, env_options, buffers):
 
 
 def check_values(args, env_ids):
-    """Refuse a number out of its range, and a word that is not among those of its flag."""
+    """Refuse a number that is out of its range, and a word that its flag does not take."""
     check_word(args, "env_id", env_ids)
     choices = {"recipe": RECIPE_WORDS}
-    if args.env_id in known_ids():  # of another one `check_buffers` says what is missing
+    if args.env_id in known_ids():  # `check_buffers` refuses an unknown id
         choices |= task_of(args.env_id).choices()
     for name, words in choices.items():
         check_word(args, name, words)
@@ -273,16 +289,17 @@ def check_values(args, env_ids):
 
 
 def check_word(args, name, words):
-    """Refuse a flag that is none of the words that it may be; a script need not have it."""
+    """Refuse a flag whose value is none of `words`. A flag that the script does not have is not checked."""
     value = getattr(args, name, words[0])
     if value not in words:
         refuse(name, value, f"must be one of {', '.join(words)}")
 
 
 def check(args, env_ids):
-    """Refuse what no run can use: SystemExit with one line that names the flag, the value and what is allowed.
+    """Refuse arguments that no run can use.
 
-    args is a script's Args, env_ids the script's environments.
+    args is a script's Args, env_ids are the script's environments. Raises SystemExit with one line that names the flag,
+    the value and what is allowed.
     """
     check_values(args, env_ids)
     if args.embed_dim % args.num_heads:
@@ -295,7 +312,7 @@ def check(args, env_ids):
 
 
 def schedule_values(name, schedule):
-    """The numbers that a schedule goes through; one line if it is none."""
+    """The numbers that a schedule goes through. Ends with one line if it is no schedule."""
     if not isinstance(schedule, str):
         return [float(schedule)]
     try:
@@ -324,9 +341,10 @@ def check_outputs(args):
 
 
 def check_buffers(args, buffers):
-    """Refuse a script's BUFFERS whose scale does not fit the observations, and an id that no environment has.
+    """Refuse BUFFERS whose scale does not fit the observations, and an id that no environment has.
 
-    buffers are those of --env-id. Only `observation_scale` is one number an observation; the others are the script's.
+    buffers are those of --env-id. `observation_scale` has to hold one number for each observation. Other buffers are
+    not checked.
     """
     try:
         spec = gym.spec(args.env_id)
@@ -345,15 +363,19 @@ def check_buffers(args, buffers):
 
 
 def check_share(args, typed):
-    """What each of torchrun's processes flies: at least one episode a minibatch, and whole groups.
+    """Give each process of torchrun at least one episode a minibatch, and whole groups.
 
-    --num-minibatches and --flights-per-start are lowered where they were left alone, with a printed line.
+    --num-minibatches and --flights-per-start are lowered with a printed line if they were not typed. If they were
+    typed, they are refused.
     """
     processes = int(os.environ.get("WORLD_SIZE", 1))
     if args.num_envs < processes:
         refuse("num_envs", args.num_envs, f"must be at least the number of processes, {processes}")
-    smallest, largest = args.num_envs // processes, -(-args.num_envs // processes)  # the first processes fly one more
-    total_envs = f"--num-envs {args.num_envs}" + (f" / {processes} processes" if processes > 1 else "")
+    smallest = args.num_envs // processes
+    largest = -(-args.num_envs // processes)  # the first processes fly one more
+    total_envs = f"--num-envs {args.num_envs}"
+    if processes > 1:
+        total_envs += f" / {processes} processes"
 
     if args.num_minibatches > smallest:
         if "num_minibatches" in typed:
@@ -378,7 +400,8 @@ def check_share(args, typed):
 
 def largest_group(most, shares):
     """The largest group of at most `most` flights that divides every process's share of the environments."""
-    return next(group for group in range(most, 0, -1) if all(share % group == 0 for share in shares))
+    fitting = [group for group in range(1, most + 1) if all(share % group == 0 for share in shares)]
+    return fitting[-1]
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -387,7 +410,10 @@ def largest_group(most, shares):
 
 
 def start(main):
-    """Run a script's `main(argv)`: Ctrl-C and SIGTERM end it with status 130 and 143, bad input with one line and 1."""
+    """Run a script's `main(argv)`.
+
+    Ctrl-C ends it with exit status 130, SIGTERM with 143, and bad input with one line and 1.
+    """
     status = [128 + signal.SIGINT]
 
     def interrupt(signum, _):
@@ -405,7 +431,7 @@ def start(main):
 
 
 def prepare_torch(args):
-    """Threads, seeds and torchrun's processes; returns the device of the networks."""
+    """Set the threads and seeds of torch, and join torchrun's processes. Returns the device of the networks."""
     keep_memory()
     torch.set_num_threads(args.num_threads or torch.get_num_threads())
     torch.manual_seed(args.seed)
@@ -415,28 +441,32 @@ def prepare_torch(args):
 
 
 def make_envs(args, env_options):
-    """This process's share of the environments, seeded; env_options go to each.
-
-    An evaluation draws its starts as a reset does: its seed would train on them, so another takes its place.
-    """
+    """This process's share of the environments, made with env_options and seeded."""
     rank, processes = rank_and_world_size()
     share = args.num_envs // processes + (rank < args.num_envs % processes)
     envs = make_batch(args.env_id, share, **env_options)
     seed = args.seed + 2**31 * rank
-    envs.reset(seed=seed + 2**40 if seed in (args.eval_seed, TRAINING_EVAL_SEED) else seed)
+    if seed in (args.eval_seed, TRAINING_EVAL_SEED):
+        seed += 2**40  # a reset draws as an evaluation does, so this seed would train on the starts of the evaluation
+    envs.reset(seed=seed)
     return envs
 
 
 def load_checkpoint(agent, args, saved):
-    """Put the weights of --checkpoint, if there is one, into a new agent; one line if they do not fit."""
+    """Put the weights of --checkpoint into a new agent. Does nothing without it or with --resume.
+
+    Ends with one line if the weights do not fit the agent.
+    """
     if args.checkpoint is None or args.resume is not None:
         return
     expected = {name: tuple(tensor.shape) for name, tensor in agent.state_dict().items()}
     shapes = {name: array.shape for name, array in saved["tensors"].items()}
-    if differing := [name for name in {**expected, **shapes} if expected.get(name) != shapes.get(name)]:
+    differing = [name for name in {**expected, **shapes} if expected.get(name) != shapes.get(name)]
+    if differing:
         name = differing[0]
-        theirs, here = (shape.get(name, "missing") for shape in (shapes, expected))
-        why = f"{name} is {theirs} in the file and {here} in this script"
+        in_file = shapes.get(name, "missing")
+        here = expected.get(name, "missing")
+        why = f"{name} is {in_file} in the file and {here} in this script"
         todo = "train it anew, or fly it by the version that trained it (CHANGELOG.md)"
         fail(f"--checkpoint {args.checkpoint}: does not fit its own args, BUFFERS or features ({why}); {todo}")
     for name, constant in constants_of(agent).items():
@@ -445,21 +475,28 @@ def load_checkpoint(agent, args, saved):
             break
     try:
         agent.load_state_dict({name: torch.from_numpy(array) for name, array in saved["tensors"].items()})
-    except (RuntimeError, TypeError) as error:  # a type that torch does not have
+    except (RuntimeError, TypeError) as error:  # the file can have a number type that torch does not have
         fail(f"--checkpoint {args.checkpoint}: its weights do not fit its own args ({error})")
     if agent.actor_logstd.requires_grad and not saved["keeps_log_std"]:
         torch.nn.init.constant_(agent.actor_logstd, float(args.log_std))
     if not args.eval_only:
-        print(f"begins with {args.checkpoint}, sha256 {hashlib.sha256(Path(args.checkpoint).read_bytes()).hexdigest()}")
+        digest = hashlib.sha256(Path(args.checkpoint).read_bytes()).hexdigest()
+        print(f"begins with {args.checkpoint}, sha256 {digest}")
 
 
 def constants_of(agent):
-    """The buffers of a new agent that no training changes, by name; one that a training fills is zeros in it."""
+    """{name: buffer} of a new agent, without the buffers that a training changes or fills.
+
+    A buffer that a training fills is zero in a new agent.
+    """
     return {name: x for name, x in agent.named_buffers() if x.any() and name not in CHANGED_BY_TRAINING}
 
 
 def finite(values, epoch, minibatch):
-    """These logged tensors as numbers, in one copy from a GPU. FloatingPointError that names one that is not finite."""
+    """The logged tensors {name: ()} as numbers, in one copy from a GPU.
+
+    Raises FloatingPointError with the name of the first number that is not finite.
+    """
     numbers = dict(zip(values, torch.stack(list(values.values())).tolist()))
     for name, number in numbers.items():
         if not math.isfinite(number):
@@ -472,27 +509,33 @@ def finite(values, epoch, minibatch):
 # ---------------------------------------------------------------------------------------------------------------------
 
 SAVE_EVERY = 10  # updates
-TRAINING_EVAL_SEED = 2**31  # beyond --eval-seed: no reported start is flown during training
+TRAINING_EVAL_SEED = 2**31  # beyond every --eval-seed, so no reported start is flown during training
 
 
 class Run:
-    """One run: `with run:` opens its folder and keeps what was learned whatever ends the training, `end_update` counts,
-    saves, evaluates and logs, `finish` makes the reported evaluation. Under torchrun only the first process writes.
+    """One run with its folder, counters, messages and evaluations. Under torchrun only the first process writes.
 
-    `progress` holds the counters; `training_seconds` are those of rollouts and updates, `wall_seconds` all until the
-    end of the last rollout and update: the evaluations and saves before it, too.
+    - `with run:` opens the folder, and saves what was learned however the training ends
+    - `end_update` counts, saves, evaluates and logs
+    - `finish` makes the reported evaluation
+
+    `progress` holds the counters. `training_seconds` is the time of rollouts and updates. `wall_seconds` is all time up
+    to the end of the last update, with the evaluations and saves before it.
     """
 
     def __init__(self, args, saved, agent, average, optimizer, envs, env_options, describe):
-        self.args, self.envs, self.env_options, self.describe = args, envs, env_options, describe
-        self.first_steps = envs.episode_steps  # training may make episodes of `envs` longer or shorter
+        self.args = args
+        self.envs = envs
+        self.env_options = env_options
+        self.describe = describe
+        self.first_steps = envs.episode_steps  # training may make the episodes of `envs` longer or shorter
         self.modules = {"agent": agent, "average": average, "optimizer": optimizer}
         self.rank, _ = rank_and_world_size()
         self.task: Task = task_of(args.env_id)
-        self.folder: Any = None  # a Path; it and TensorBoard's writer are of the first process, from `with run:` on
+        self.folder: Any = None  # a Path; only the first process sets it and the writer, in `with run:`
         self.writer: Any = None
         self.metrics = {}
-        if self.rank > 0:  # the same weights, other noise
+        if self.rank > 0:  # all processes have the same weights, but draw other noise
             torch.manual_seed(args.seed + 2**31 * self.rank)
         self.progress = {"seed": args.seed, "total_updates": 0, "global_step": 0}
         self.progress |= {"training_seconds": 0.0, "wall_seconds": 0.0}
@@ -506,7 +549,7 @@ class Run:
 
     @property
     def updates_done(self):
-        """Updates that are learned and counted."""
+        """The number of updates that are learned and counted."""
         return self.progress["total_updates"]
 
     def __enter__(self):
@@ -521,12 +564,12 @@ class Run:
             self.solve_reference()
         except BaseException:
             if is_new:
-                with contextlib.suppress(OSError):  # what holds other runs, or files, stays
+                with contextlib.suppress(OSError):  # a folder that holds other runs or files stays
                     self.folder.rmdir()
                     self.folder.parent.rmdir()
             raise
         print(f"run folder: {self.folder}", flush=True)
-        for leftover in self.folder.glob(".*.tmp"):  # of a writer that was killed
+        for leftover in self.folder.glob(".*.tmp"):  # a killed writer leaves such a file
             leftover.unlink()
         arguments = {**asdict(self.args), "resume": None}
         if self.args.save_model:
@@ -537,7 +580,7 @@ class Run:
         return self
 
     def solve_reference(self):
-        """The optima that evaluations fly, before anything is learned: one that does not exist is said at once."""
+        """Find the optima that evaluations fly before anything is learned. A missing optimum ends the run here."""
         evaluates_on_the_way = 0 < self.args.eval_every <= self.args.total_updates
         seeds = [TRAINING_EVAL_SEED] * evaluates_on_the_way + [self.args.eval_seed]
         for seed in seeds:
@@ -549,11 +592,12 @@ class Run:
         if error is None:
             return
         if not isinstance(error, KeyboardInterrupt | FloatingPointError):
-            with contextlib.suppress(OSError):  # a full disk is perhaps what ended it
+            with contextlib.suppress(OSError):  # a full disk may be what ended the training
                 self.save()
             return
         self.save()
-        updates, saved = self.state["progress"]["total_updates"], self.args.save_model and self.rank == 0
+        updates = self.state["progress"]["total_updates"]
+        saved = self.args.save_model and self.rank == 0
         if isinstance(error, FloatingPointError):
             kept = f"; the last good checkpoint is {self.folder}/training_state.pt" if saved else ""
             fail(f"update {updates + 1}: {error}, must be finite{kept}")
@@ -568,11 +612,12 @@ class Run:
             save_run(self.folder, self.state)
 
     def end_update(self, iteration, alive, episodes, losses, learning_rate):
-        """Count an update; save every ten, evaluate every --eval-every, log it and now and then print a line.
+        """Count and log an update. Save every ten updates, evaluate every --eval-every, and print a line now and then.
 
-        alive (T, N) is the batch's, episodes the `final_info` of all, losses the means over the update.
+        alive (T, N) is the batch's. episodes is the `final_info` of all processes. losses are means over the update.
         """
-        args, now = self.args, time.time()
+        args = self.args
+        now = time.time()
         steps = int(all_reduce_sum(alive.sum()))
         self.progress = {**self.progress, "total_updates": iteration, "wall_seconds": now - self.began}
         self.progress["global_step"] += steps
@@ -589,14 +634,16 @@ class Run:
             self.log("losses", losses)
             if iteration % (args.eval_every or max(1, args.total_updates // 100)) == 0 or iteration == 1:
                 self.print_line(episodes)
-        self.state = state  # only now: where an evaluation is interrupted, a resume makes its update again
+        self.state = state  # only now, so that a resume repeats an update whose evaluation was interrupted
         if iteration % SAVE_EVERY == 0 or iteration == args.total_updates:
             self.save()
         self.update_began = time.time()
 
     def print_line(self, episodes):
-        """A line to follow the run by."""
-        done, of, seconds = self.progress["total_updates"], self.args.total_updates, time.time() - self.began
+        """Print how far the run is, what the sampled episodes earned and what the last evaluation found."""
+        done = self.progress["total_updates"]
+        of = self.args.total_updates
+        seconds = time.time() - self.began
         clock = f"{seconds / 60:.1f} min gone, {(of - done) * seconds / done / 60:.1f} to go"
         line = f"update {done}/{of}, {self.progress['global_step']} steps, {clock}"
         print(f"{line}: {self.describe(episodes, self.metrics)}", flush=True)
@@ -608,7 +655,7 @@ class Run:
                 self.writer.add_scalar(f"{prefix}/{name}", value, self.progress["global_step"])
 
     def evaluate(self, eval_seed):
-        """Fly the mean action of the averaged weights and the optimum: eval.json's metrics and eval.npz's arrays."""
+        """Fly the mean action of the averaged weights, and the optimum. Returns the metrics and arrays of eval.*."""
         average = self.modules["average"].module
         policy = average.make_policy(self.longest_episode)
         metrics, arrays = self.task.evaluate(policy, eval_seed, self.flights(eval_seed), **self.env_options)
@@ -617,22 +664,24 @@ class Run:
 
     @property
     def longest_episode(self):
-        """Steps that an episode of an evaluation has at most."""
+        """The most steps that an episode of an evaluation can have."""
         return max(self.first_steps, self.envs.episode_steps)
 
     def flights(self, eval_seed):
-        """How many flights the evaluation of a seed has."""
+        """The number of flights in the evaluation of a seed."""
         if eval_seed == TRAINING_EVAL_SEED:
             return self.task.interim_flights(self.args.eval_starts, **self.env_options)
         return self.args.eval_starts
 
     def finish(self):
-        """Fly the reported starts; write the evaluation where it was asked for, print the table."""
+        """Fly the reported starts, write the evaluation and print the table."""
         args = self.args
         if self.rank > 0:
             return
         metrics, arrays = self.evaluate(args.eval_seed)
-        timed_policy = self.modules["average"].module.make_policy(self.longest_episode) if args.eval_only else None
+        timed_policy = None
+        if args.eval_only:
+            timed_policy = self.modules["average"].module.make_policy(self.longest_episode)
         metrics |= self.task.reported_metrics(metrics, timed_policy, **self.env_options)
         if args.eval_only:
             write_evaluation(metrics, arrays, args.checkpoint, args.eval_json, args.eval_npz)
@@ -651,7 +700,7 @@ class Run:
 
 
 def new_folder(name):
-    """A new runs/{name}__{unix time}; of two runs that start within a second the later one waits for the next."""
+    """Make a new folder runs/{name}__{unix time}. If another run has taken this second, wait for the next one."""
     while True:
         folder = Path(f"runs/{name}__{int(time.time())}")
         try:
@@ -664,7 +713,10 @@ def new_folder(name):
 
 
 def new_writer(folder, first_step, arguments):
-    """TensorBoard's writer, with the hyperparameters as text, as CleanRL's; a resumed run drops what it does again."""
+    """TensorBoard's writer, with the hyperparameters as a text table, as in CleanRL.
+
+    TensorBoard drops events from `first_step` on, because a resumed run writes them again.
+    """
     from torch.utils.tensorboard import SummaryWriter
 
     writer = SummaryWriter(folder, purge_step=first_step)
@@ -674,13 +726,16 @@ def new_writer(folder, first_step, arguments):
 
 
 def track(args, name):
-    """Follow the run with Weights and Biases; a resumed run goes on with the one that it began. One line on failure."""
+    """Follow the run with Weights and Biases. A resumed run goes on with its own earlier record.
+
+    Ends with one line on failure.
+    """
     import wandb  # pyright: ignore[reportMissingImports] - optional, not among the requirements
 
     names = {"project": args.wandb_project_name, "entity": args.wandb_entity, "name": name, "id": name}
     try:
         wandb.init(**names, resume="allow", sync_tensorboard=True, config=asdict(args), save_code=True)
-    except Exception as error:  # no login, no network, no such entity: wandb's errors have no common kind
+    except Exception as error:  # wandb's errors (no login, no network, no such entity) have no common class
         fail(f"--track: Weights and Biases refuses the run ({error}); `wandb login` first, or leave --track out")
 
 
@@ -690,7 +745,7 @@ def track(args, name):
 
 
 def training_state(args, modules, envs, progress):
-    """All that a bit-exact resume needs, copied, so that training can go on while it is kept."""
+    """A copy of all that a bit-exact resume needs. Training does not change the copy."""
     modules = {name: module.state_dict() for name, module in modules.items()}
     rng = {"torch": torch.get_rng_state()}
     rng |= {name: json.dumps(stream.bit_generator.state) for name, stream in envs.generators.items()}
@@ -699,7 +754,10 @@ def training_state(args, modules, envs, progress):
 
 
 def restore(state, run_dir, modules, envs):
-    """Put everything back where `training_state` found it; returns the progress. One line if something does not fit."""
+    """Put everything back where `training_state` found it. Returns the progress.
+
+    Ends with one line if something does not fit.
+    """
     try:
         for name, constant in constants_of(modules["agent"]).items():
             if not torch.allclose(constant.cpu(), state["agent"][name], rtol=1e-6):
@@ -714,15 +772,15 @@ def restore(state, run_dir, modules, envs):
         for name, stream in envs.generators.items():
             stream.bit_generator.state = json.loads(rng[name])
         return {name: state["progress"][name] for name in COUNTERS}
-    except Exception as error:  # an edited file fails in many ways, all alike to the user
+    except Exception as error:  # an edited file fails in many ways, which are all the same to the user
         allowed = "must be whole, and of the script and vehicle as they are"
         fail(f"--resume {run_dir}: its training_state.pt does not fit ({error}); {allowed}")
 
 
 def load_state(run_dir, kind, env_ids):
-    """The training state of a run folder; one line if there is none, or it is damaged or another script's.
+    """The training state of a run folder. kind is the script's Args, env_ids are its environments.
 
-    kind is the script's Args, env_ids its environments.
+    Ends with one line if the state is missing, damaged or of another script.
     """
     try:
         path = Path(run_dir) / "training_state.pt"
@@ -730,9 +788,10 @@ def load_state(run_dir, kind, env_ids):
         if damaged:
             raise ValueError(f"{damaged} is damaged")
         state = torch.load(path, map_location="cpu", weights_only=True)
-        # a flag that came after this run changes nothing where its default is None; any other is refused below
-        came_later = {name: value for name, value in vars(kind()).items() if value is None}
-        args = state["args"] = {**came_later, **state["args"]}
+        # a flag that is newer than this run changes nothing if its default is None; any other is refused below
+        newer = {name: value for name, value in vars(kind()).items() if value is None}
+        args = {**newer, **state["args"]}
+        state["args"] = args
         kinds = get_type_hints(kind)
         if args["env_id"] not in env_ids:
             raise ValueError(f"it is of {args['env_id']}; this script takes {', '.join(env_ids)}")
@@ -741,17 +800,19 @@ def load_state(run_dir, kind, env_ids):
         wrong = [name for name in kinds if not isinstance(args[name], kinds[name])]
         if wrong:
             raise ValueError(f"{wrong[0]} is {args[wrong[0]]!r}")
-    except Exception as error:  # a missing, damaged or foreign file fails in many ways, all alike to the user
+    except Exception as error:  # a missing or damaged file fails in many ways, which are all the same to the user
         fail(f"--resume {run_dir}: must hold a training_state.pt of {kind().exp_name}.py ({error})")
     return state
 
 
 def save_run(run_dir, state):
-    """Write the training state and, derived from it, the weights that evaluation uses; each whole or not at all."""
-    torch.save(state, buffer := io.BytesIO())
+    """Write the training state, and the averaged weights in it as agent.safetensors. A file is never half-written."""
+    buffer = io.BytesIO()
+    torch.save(state, buffer)
     files.write_bytes(run_dir / "training_state.pt", buffer.getbuffer())
     metadata = {"env_id": state["args"]["env_id"], "args": json.dumps(state["args"]), **state["progress"]}
-    weights = {k.removeprefix("module."): v.cpu() for k, v in state["average"].items() if k != "n_averaged"}
+    averaged = {name: x for name, x in state["average"].items() if name != "n_averaged"}
+    weights = {name.removeprefix("module."): x.cpu() for name, x in averaged.items()}
     data = safetensors.torch.save(weights, {key: str(value) for key, value in metadata.items()})
     files.write_bytes(run_dir / "agent.safetensors", data)
 
@@ -762,10 +823,10 @@ def save_run(run_dir, state):
 
 
 def keep_memory():
-    """Let glibc keep what tensors free, for the next ones; without glibc nothing happens.
+    """Let glibc keep the memory that tensors free, for the next tensors. Without glibc nothing happens.
 
-    It would hand large blocks back to the system, which clears each page before it lends it again: a tenth of an update
-    of the small networks, a quarter at Table 1's size.
+    By default glibc hands large blocks back to the system, which clears each page before it lends the page again. The
+    clearing takes a tenth of an update of the small networks, and a quarter at Table 1's size.
     """
     with contextlib.suppress(AttributeError, TypeError):
         mallopt = ctypes.CDLL(None).mallopt
@@ -774,21 +835,25 @@ def keep_memory():
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Processes: torchrun starts several of a script, which share the environments and sum what they find
+# Processes: torchrun starts several processes of a script, which share the environments and sum their gradients
 # ---------------------------------------------------------------------------------------------------------------------
 
 
 def join_processes(cuda):
-    """Under torchrun, which sets RANK, become one of its processes, each with its own GPU if there are."""
-    if "RANK" in os.environ and not dist.is_initialized():
-        if gpu := torch.cuda.is_available() and cuda:
-            torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
-        dist.init_process_group("nccl" if gpu else "gloo")
+    """Under torchrun, which sets RANK, become one of its processes. With GPUs each process takes its own."""
+    if "RANK" not in os.environ or dist.is_initialized():
+        return
+    use_gpu = torch.cuda.is_available() and cuda
+    if use_gpu:
+        torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
+    dist.init_process_group("nccl" if use_gpu else "gloo")
 
 
 def rank_and_world_size():
-    """Rank and number of the processes that torchrun started; 0, 1 without it."""
-    return (dist.get_rank(), dist.get_world_size()) if dist.is_initialized() else (0, 1)
+    """This process's rank, and the number of processes that torchrun started. Without torchrun they are 0 and 1."""
+    if not dist.is_initialized():
+        return 0, 1
+    return dist.get_rank(), dist.get_world_size()
 
 
 def all_gather(value):
@@ -800,19 +865,21 @@ def all_gather(value):
 
 
 def local_shard(values, count):
-    """Of all processes' `values`, in the order of their ranks, the `count` of this one."""
+    """This process's part of `values`, which hold `count` values for each process in the order of their ranks."""
     rank, _ = rank_and_world_size()
     begin = sum(all_gather(count)[:rank])
     return values[begin : begin + count]
 
 
 def sum_gradients(agent):
-    """Sum the gradients over all processes, in place, in one buffer: small exchanges cost their latency."""
-    if dist.is_initialized():
-        gradients = [parameter.grad for parameter in agent.parameters() if parameter.grad is not None]
-        flat = all_reduce_sum(torch.cat([gradient.flatten() for gradient in gradients]))
-        for gradient, part in zip(gradients, flat.split([gradient.numel() for gradient in gradients])):
-            gradient.copy_(part.view_as(gradient))
+    """Sum the gradients over all processes, in place. One buffer holds them all, because each exchange takes time."""
+    if not dist.is_initialized():
+        return
+    gradients = [parameter.grad for parameter in agent.parameters() if parameter.grad is not None]
+    flat = all_reduce_sum(torch.cat([gradient.flatten() for gradient in gradients]))
+    parts = flat.split([gradient.numel() for gradient in gradients])
+    for gradient, part in zip(gradients, parts):
+        gradient.copy_(part.view_as(gradient))
 
 
 def all_reduce_sum(x):

@@ -47,7 +47,7 @@ def load(checkpoint):
 
 
 def observations(agent, args, options, eval_seed):
-    """One flight of the mean action: what was observed (T, obs), when (T,) s, and when a new phase began, s."""
+    """One flight of the mean action: observations (T, obs), their times (T,) in s, and the begins of phases in s."""
     environment = gym.make_vec(args.env_id, num_envs=1, **options)
     obs, _ = environment.reset(options=task_of(args.env_id).reset_options(eval_seed, 1, **options))
     policy, seen, phases, ended = agent.make_policy(environment.episode_steps), [], [], np.array([False])
@@ -63,8 +63,8 @@ def observations(agent, args, options, eval_seed):
 def weights(agent, obs):
     """The attention weights (blocks, H, T, L + 1) of a flight's steps, by distance: 0 is the step itself.
 
-    A_ij = (x_i W^Q) (x_j W^K + R_{i-j})^T / sqrt(d_k) and its softmax over j = i - L .. i, written out once more. What
-    lies before the start is the evaluation's memory of zeros; its weight counts.
+    They are A_ij = (x_i W^Q) (x_j W^K + R_{i-j})^T / sqrt(d_k) and its softmax over j = i - L .. i, written out again.
+    Before the start lies the evaluation's memory of zeros, whose weights count.
     """
     inputs, L, T = [], agent.memory_length, len(obs)
     hooks = [block.attention.register_forward_pre_hook(lambda _, given: inputs.append(given)) for block in agent.blocks]

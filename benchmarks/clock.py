@@ -1,10 +1,10 @@
-"""A small problem's script whose policy sees time as a clock's hands, too: what then is left for the memory?
+"""A small problem's script whose policy also sees time as a clock's hands. What is then left for the memory?
 
     python benchmarks/clock.py ppo_gtrxl_di.py --env-id DoubleIntegratorWaypoints-v0 --memory-length 0 --seed 1
 
-Behind the script stand its flags; all of them work, --eval-only and --resume, too. Over 100 steps tau, time as a number
-from 0 to 1, changes by a hundredth from one to the next, its sines and cosines by up to one. The policy's input is all
-that differs. results/memory/clock holds what came out.
+The script's flags follow its name. All of them work, also --eval-only and --resume. In an episode of 100 steps tau,
+time as a number from 0 to 1, changes by 0.01 in a step. Its sines and cosines change by up to 1. Only the policy's
+input differs from the script's. The results are in results/memory/clock.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ TAU = {3: 2, 6: 4}  # its place in an observation of one phase, of several
 
 
 def with_hands(features):
-    """A script's `features` and, behind them, sin and cos of 2 pi k tau for k in TURNS: (..., inputs + 10)."""
+    """A script's `features`, then sin and cos of 2 pi k tau for k in TURNS: (..., inputs + 10)."""
 
     def seen(agent, obs):
         tau = obs[..., TAU[obs.shape[-1]], None]

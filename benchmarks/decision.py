@@ -1,10 +1,10 @@
-"""A policy's decision by onnxruntime beside torch's: the time of one on one core, and how far their actions differ.
+"""A policy's decision by onnxruntime and by torch: its time on one core, and the difference of the actions.
 
     python benchmarks/decision.py results/rocket_cutoff
 
-Exports the policy and flies it once. Both decide on the same observations, and each carries its own memory along. torch
-decides in float32, as evaluations do, and in float64: features that are small differences of large numbers have their
-rounding in float32.
+Exports the policy and flies it once. Both decide on the same observations, and each has its own memory. torch decides
+in float32, as evaluations do, and in float64, because features that are small differences of large numbers are rounded
+in float32.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class OnnxPolicy:
 def compare(env_id: str, policies: dict, n: int = 1, seed: int = 0, **env_options):
     """Fly the first of `policies` on n flights and ask the others, too, on the same observations.
 
-    Returns microseconds of a decision (median) and the actions (T, n, actions), by policy; actions behind a flight's
+    Returns the median microseconds of a decision and the actions (T, n, actions), by policy. Actions after a flight's
     end are NaN.
     """
     envs = gym.make_vec(env_id, num_envs=n, **env_options)

@@ -2,7 +2,7 @@
 
     python benchmarks/env_speed.py [--num-envs 128] [--seconds 1]
 
-Of each the best of three runs.
+It prints the best of three runs of each.
 """
 
 from __future__ import annotations

@@ -4,8 +4,8 @@
     python benchmarks/gpu_speed.py --sizes di vdp rocket table1 --ways graphs
     python benchmarks/gpu_speed.py --sizes tiny --cpu                  # that it runs, without a GPU
 
-Each size and way runs in a process of its own. All prepare at once; what is timed is timed by one process after the
-other. Printed are
+Each size and way runs in its own process. All processes prepare at the same time, and are timed one after the other.
+It prints
 
 - the seconds of an update, the median of three, and of its rollout and its epochs
 - where one more update spends its seconds, with the GPU waited for after each part
@@ -55,7 +55,7 @@ def synchronize():
 
 
 class Stopwatch:
-    """Seconds spent in wrapped functions, by name; the GPU's work is waited for."""
+    """The seconds spent in wrapped functions, by name. The stopwatch waits for the GPU's work."""
 
     def __init__(self):
         self.seconds = Counter()
@@ -199,7 +199,7 @@ def profile(call):
 
 
 def measure(size, way, tf32, device, lock, results):
-    """All figures of one size and way, into `results`; an error is printed and ends only this one."""
+    """Put all numbers of one size and way into `results`. An error is printed and ends only this one."""
     name = f"{size} {way}{' TF32' if tf32 else ''}"
     try:
         torch.set_num_threads(1)
@@ -224,7 +224,7 @@ def measure(size, way, tf32, device, lock, results):
 
 
 def report(results):
-    """The tables."""
+    """Print the tables."""
     for name, figures in results.items():
         parts = "  ".join(f"{part} {seconds:.3f}" for part, seconds in figures["parts"].items())
         print(f"\n{name}: update {figures['update']:.3f} s  KL of rounding {figures['kl']:.2g}")

@@ -8,14 +8,15 @@
     python benchmarks/gradient.py dispersed --save runs/gradient.safetensors
     python evaluate.py opponents results/rocket_dispersed --also gradient=runs/gradient.safetensors
 
-PPO tries actions and learns from what they earn. Who knows the equations of motion can ask how the end of a flight
-changes with each weight of the policy. The equations are the environments' own: with torch tensors in the place of
-NumPy arrays autograd differentiates them, with stagings, cut-off, drawn vehicles and wind. The network is the scripts'
-`Agent`, an MLP where it has no blocks; what it sees and how it is evaluated are theirs, too. So a row differs from
-PPO's in how it is trained and in what it knows: it is given the model, as the classical laws are.
+PPO tries actions and learns from what they earn. With the equations of motion one can compute how the end of a flight
+changes with each weight of the policy. We use the environments' equations. With torch tensors in place of NumPy arrays
+autograd differentiates them, with stagings, cut-off, drawn vehicles and wind. The network is the scripts' `Agent`,
+which is an MLP if it has no blocks. Its features and its evaluation are the scripts', too. So a row differs from PPO's
+row in its training and in its knowledge: it is given the model, as the classical laws are.
 
 Reading order: double integrator, rocket's physics, flights, derivative, training, rows, table and command.
-T steps, n flights, W weights. Training is in float64; what is saved and evaluated is float32, as everywhere.
+T is the number of steps, n of flights, W of weights. Training is in float64. The saved and evaluated policy is in
+float32, as everywhere.
 """
 
 from __future__ import annotations
@@ -83,7 +84,7 @@ SPARE = 100.0  # s
 
 
 class Leg(NamedTuple):
-    """From one event of a step to the next, in all steps of n flights: (T, n) each unless said."""
+    """The parts of steps between two events, in all steps of n flights: (T, n) each unless a comment says otherwise."""
 
     seconds: torch.Tensor
     thrust: torch.Tensor  # N
@@ -93,7 +94,7 @@ class Leg(NamedTuple):
 
 
 def legs_of(env, T: int) -> list[Leg]:
-    """Those of the vehicles that the last reset drew. Events come by the clock: no steering changes them."""
+    """The legs of the vehicles that the last reset drew. Events come by the clock, so steering does not change them."""
     vehicles, who = env.vehicles, np.arange(env.num_envs)
     step = np.arange(T)[:, None]
     at = np.minimum(env.dt * step, vehicles.burn_out)  # (T, n)
@@ -207,7 +208,7 @@ def fly(agent, env) -> Flights:
 
 
 def directions(agent, physics: Physics, y, shown, cache, t):
-    """What the policy does in states y (..., 7) where `shown` (..., 3) is observed, too: directions (..., 3) in ECI."""
+    """The policy's directions (..., 3) in ECI, in states y (..., 7) with the other observations `shown` (..., 3)."""
     obs = torch.cat([y[..., :6], shown], dim=-1)
     return physics.to_eci(agent.get_mean_action(agent.encode_step(obs, cache, t)), y)
 
@@ -218,7 +219,7 @@ def directions(agent, physics: Physics, y, shown, cache, t):
 
 
 def weights_of(agent) -> list:
-    """What the mean action depends on."""
+    """The weights on which the mean action depends."""
     return [*agent.encoder.parameters(), *agent.blocks.parameters(), *agent.actor.parameters()]
 
 
@@ -249,7 +250,7 @@ def all_rows(outputs, weights: list, rows):
 class Window:
     """Keys and values of the last L + 1 steps, for `RelativeAttention.step`, which writes into its cache.
 
-    Autograd cannot follow that; it can follow a new tensor for every step.
+    Autograd cannot follow writes into one cache. It can follow a new tensor for every step.
     """
 
     def __init__(self, kv):
@@ -263,7 +264,7 @@ class Window:
 
 
 def empty_cache(agent, n: int) -> list:
-    """What `Agent.encode_step` remembers at the begin of a flight."""
+    """The caches of `Agent.encode_step` at the begin of a flight."""
     cache = []
     for block, memory in zip(agent.blocks, agent.new_memory(n, noise=0.0)):
         kv, projections, R = block.attention.start_cache(memory, 0)
@@ -367,11 +368,11 @@ def train_problem(agent, env, recipe: Recipe, curve: Curve):
 
 
 def train_rocket(agent, env, recipe: Recipe, curve: Curve):
-    """Towards the target first, then, with the error kept at zero, towards more mass.
+    """Train a rocket's policy towards the target first, and then towards more mass with the error kept at zero.
 
-    Of n flights 6 n errors have to vanish, fewer than there are weights. Newton's step with the least change of the
-    weights corrects them. Adam follows the gradient of the mean mass, without what would change an error: Rosen's
-    gradient projection.
+    n flights have 6 n errors that have to vanish, fewer than there are weights. Newton's step with the least change of
+    the weights corrects the errors. Adam follows the gradient of the mean mass, without the part that would change an
+    error. This is Rosen's gradient projection.
     """
     weights = weights_of(agent)
     theta = parameters_to_vector(weights).detach()  # (W,)
@@ -426,7 +427,7 @@ DISPERSED_KEYS |= {"dispersed_mass_mean_kg": "mass (kg)"}
 
 @dataclass(frozen=True)
 class Row:
-    """A training, what is printed of it, and the folder of results/ with PPO's on the same problem."""
+    """A training, its label, and the folder of results/ with PPO's policies for the same problem."""
 
     title: str
     env_id: str
@@ -467,7 +468,7 @@ ROWS = {
 
 
 def make_envs(row: Row, n: int, seed: int):
-    """n environments of a row, their random numbers beginning with a seed, and their options."""
+    """n environments of a row, seeded, and their options."""
     args = row.script.Args(env_id=row.env_id)
     options = {name: getattr(args, name) for name in row.script.ENV_OPTIONS} | row.script.FIXED_OPTIONS
     if row.dispersion:
@@ -525,7 +526,7 @@ def decision_us(env, policy) -> float:
 
 
 def policy_file(agent, args, curve: Curve, recipe: Recipe) -> bytes:
-    """An agent.safetensors as the scripts write it, so that they fly it as one of theirs."""
+    """An agent.safetensors in the scripts' form, so that the scripts can fly it."""
     seconds = 60 * curve.points[-1]["minutes"]
     counters = {"seed": args.seed, "total_updates": recipe.updates, "global_step": 0}
     counters |= {"training_seconds": seconds, "wall_seconds": seconds}
@@ -555,7 +556,7 @@ def cell(values: list) -> str:
 
 
 def read(path: Path) -> dict:
-    """What a training wrote; ValueError names a file that is something else."""
+    """The numbers that a training wrote. Raises ValueError that names a file of another kind."""
     try:
         run = json.loads(path.read_text())
         return {"flights": run["curve"][-1]["flights"], "minutes": run["curve"][-1]["minutes"], **run["final"]}

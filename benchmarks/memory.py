@@ -1,4 +1,4 @@
-"""What the memory is for: the table and the figure of results/memory, from the evaluations that its runs left there.
+"""What the memory is for: the table and the figure of results/memory, from the evaluations of its runs.
 
     python benchmarks/run_seeds.py benchmarks/memory_di_jobs.txt --at-once 2 --numbers      # trains what is missing
     python benchmarks/run_seeds.py benchmarks/memory_nominal_jobs.txt --at-once 2           # the same: hours
@@ -10,10 +10,10 @@
     python benchmarks/memory.py                                                             # prints, draws: seconds
     python benchmarks/memory.py --by-seed                                                   # a line for each run
 
-The ablation is not of the memory: it shows what each addition to PPO brings (docs/method.md).
+The ablation is not about the memory. It shows what each addition to PPO brings (docs/method.md).
 
-Each row is one way of learning, each figure the median over its seeds with the range of all. Rows without a finished
-run are left out. Beside the hidden velocity stands the expected cost that no memory can beat.
+Each row is one way of learning. Each number is the median over its seeds, with the range of all. Rows without a
+finished run are left out. The experiment with the hidden velocity also has the expected cost that no memory can beat.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ from drawing.style import save_figures  # noqa: E402
 
 @dataclass
 class Experiment:
-    """Runs that differ by one thing alone: what is asked, and the keys of eval.json that answer."""
+    """Runs that differ in one thing: the question, and the keys of eval.json that answer it."""
 
     title: str
     rows: dict[str, str]  # folder, seen from results/memory/<experiment> -> what is printed of it
     keys: dict[str, str]  # key of eval.json -> what is printed of it; the first is drawn
-    log: bool = False  # the figure's axis
-    bound: Callable | None = None  # what no memory can beat, of the keys of which that is known: () -> {key: value}
+    log: bool = False  # whether the figure's axis is logarithmic
+    bound: Callable | None = None  # () -> {key: the value that no memory can beat}, for the keys with a known one
     drawn: bool = True
 
 
@@ -55,15 +55,17 @@ def lengths(*steps):
 
 @functools.cache
 def velocity_from_the_second_step():
-    """The least ratio of sums of a first action that is made without the velocity, over the starts of eval.json.
+    """The least ratio of sums if the first action is chosen without the velocity, over the starts of eval.json.
 
     Two positions and the action between them tell the velocity, so a memory can know it from the second step on. The
-    first action is that of velocity zero, the mean over the starts: the best for the expected quadratic cost (certainty
-    equivalence, e.g. Bertsekas, Dynamic Programming and Optimal Control, vol. 1), and for that alone: others that cost
-    more on average have a lower p95. On 1000 starts and with the bound on u it holds to three digits.
+    best first action for the expected quadratic cost is that of velocity zero, the mean over the starts (certainty
+    equivalence, e.g. Bertsekas, Dynamic Programming and Optimal Control, vol. 1). For other statistics it is not the
+    best: actions that cost more on average can have a lower p95. On 1000 starts and with the bound on u the value holds
+    to three digits.
     """
     problem = envs.DOUBLE_INTEGRATOR
-    lqr, x0 = baselines.lqr_policy(problem), baselines.starts(0, 1000)
+    lqr = baselines.lqr_policy(problem)
+    x0 = baselines.starts(0, 1000)
 
     def blind_at_first(obs, t):
         return lqr(obs * [1.0, float(t > 0), 1.0], t)
@@ -73,7 +75,7 @@ def velocity_from_the_second_step():
 
 
 def rocket_rows(result):
-    """The rocket's rows. L_mem 32 is the front page's result: its runs are not trained twice."""
+    """The rocket's rows. L_mem 32 is the front page's result, whose runs are not trained twice."""
     return {
         **lengths(0, 1, 8),
         f"../../{result}": "L_mem 32",
@@ -220,13 +222,15 @@ def cell(values):
 
 
 def cell_of(runs, key):
-    """The cell of a key, with the number of runs that have it where not all do: without a hit there is no ratio."""
+    """The cell of a key, with the number of runs that have it if some do not. A run without hits has no ratio."""
     values = [run[key] for run in runs if key in run]
-    return f"{cell(values)}, {len(values)} of {len(runs)}" if 0 < len(values) < len(runs) else cell(values)
+    if 0 < len(values) < len(runs):
+        return f"{cell(values)}, {len(values)} of {len(runs)}"
+    return cell(values)
 
 
 def digits(bound):
-    """A bound to the three digits to which it is known; "-" without one."""
+    """A bound with the three digits to which it is known, or "-" without one."""
     return "-" if bound is None else f"{bound:#.3g}"
 
 
@@ -247,7 +251,7 @@ def table(experiment, found, by_seed=False):
 
 
 def memory_figure(results):
-    """One panel an experiment: each seed a dot, their median a bar."""
+    """One panel for each experiment, with a dot for each seed and a bar for their median."""
     figure = Figure(figsize=(5 * len(results), 4.5), layout="constrained")
     panels = figure.subplots(1, len(results), squeeze=False)[0]
     for ax, (name, found) in zip(panels, results.items()):

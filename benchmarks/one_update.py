@@ -1,4 +1,4 @@
-"""One update of a script's flat `train` on episodes that are given: for tests and timings of the learning alone."""
+"""One update of a script's `train` on given episodes, for tests and timings of the learning alone."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class UpdateDone(Exception):
 
 
 class OneUpdate:
-    """In place of `runs.Run`: `train` begins with update `iteration` and ends after it, its losses are kept."""
+    """In place of `runs.Run`: `train` begins with update `iteration`, its losses are kept, and it ends."""
 
     def __init__(self, iteration):
         self.updates_done, self.losses = iteration - 1, None
@@ -26,10 +26,10 @@ class OneUpdate:
 
 
 def one_update(script, args, modules, envs, batch, iteration=1, group=None):
-    """All that update `iteration` of `script.train` does but for its rollout; returns its losses.
+    """Do update `iteration` of `script.train` without its rollout. Returns its losses.
 
-    modules: agent, average, optimiser. `batch` stands for what `rollout` returns. With a `group` the environments have
-    no curriculum, and need only `num_envs`.
+    modules are agent, average and optimiser. `batch` takes the place of the rollout's. With a `group` the environments
+    have no curriculum, and need only `num_envs`.
     """
     given = {"rollout": lambda *inputs: (batch, None)}
     if group is not None:

@@ -1,4 +1,4 @@
-"""How far the flights of a page, in V8, are from Python's: what eval.npz holds.
+"""The differences between the flights of a page, in V8, and Python's flights in eval.npz.
 
     python benchmarks/page_flights.py results/rocket_cutoff results/rocket_dispersed results/di
     python benchmarks/page_flights.py --changed results/rocket_dispersed      # what other vehicles do to the three laws
@@ -38,7 +38,7 @@ OPTIMA = "data.starts.map(x => planeOptimum(data.problem, x))"
 
 
 class Engine:
-    """The scripts of a page, without those that draw, in V8: `engine(expression)` is what it evaluates to."""
+    """The scripts of a page in V8, without those that draw. `engine(expression)` evaluates an expression."""
 
     def __init__(self, html: str):
         self.v8 = MiniRacer()
@@ -61,7 +61,7 @@ def page_of(folder: Path) -> str:
 
 
 def print_differences(folder: Path, engine: Engine):
-    """A line: what the page's flights differ by from the evaluation's."""
+    """Print a line with the differences of the page's flights from the evaluation's."""
     metrics, arrays = read_evaluation(folder)
     if "error_norm" in metrics:
         flight = engine(f"flyAll(data, {json.dumps(NO_CHANGES)}).policy")
@@ -77,7 +77,7 @@ def print_differences(folder: Path, engine: Engine):
 
 
 def print_changed(folder: Path, engine: Engine):
-    """||error|| of the three laws with other vehicles."""
+    """Print ||error|| of the three laws with other vehicles."""
     print(f"{folder}: ||error||{'policy':>22}{'LQR':>12}{'open loop':>12}")
     for change in CHANGED:
         flights = engine(f"flyAll(data, {json.dumps({**NO_CHANGES, **change})})")

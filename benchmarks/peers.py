@@ -1,11 +1,12 @@
-"""Stable-Baselines3 beside our results: trains what is missing in results/peers, then prints the table.
+"""Stable-Baselines3 beside our results: train the runs that results/peers lacks, then print the table.
 
     pip install -r benchmarks/requirements.txt
     python benchmarks/peers.py --at-once 2    # hours; --rows di cutoff: these alone
     python benchmarks/peers.py --table        # of what is there
 
-Each row is one way of learning, seeds 1 to 3, by `benchmarks/sb3_ppo.py` with the settings that were best for it in
-short trials (docs/other-learners.md). Figures are medians with the range of all seeds. Exit status 1 if a run failed.
+Each row is one way of learning, with seeds 1 to 3, by `benchmarks/sb3_ppo.py` with the settings that were best for it
+in short trials (docs/other-learners.md). Numbers are medians with the range of all seeds. The exit status is 1 if a run
+failed.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ DISPERSED_KEYS = {"dispersed_error_median": "median", "dispersed_error_p95": "p9
 
 @dataclass
 class Peer:
-    """A row: what is printed of it, the flags of `sb3_ppo.py`, the keys of its final evaluation, its seeds.
+    """A row: its label, the flags of `sb3_ppo.py`, the keys of its final evaluation, its seeds.
 
     `start` names an earlier row: each seed begins with the policy that it saved.
     """
@@ -66,17 +67,17 @@ PEERS = {
 
 
 def result(name, seed):
-    """Where a run writes its figures, from here: the file keeps its command, and no machine's folders."""
+    """The file in which a run writes its numbers, relative to here, so that no machine's folders are in its command."""
     return Path(os.path.relpath(FOLDER / f"{name}_{seed}.json"))
 
 
 def policy(name, seed):
-    """Where a run saves its policy, VecNormalize beside it as .pkl."""
+    """The file in which a run saves its policy. VecNormalize is beside it as .pkl."""
     return Path(f"runs/peer_{name}_{seed}.zip")
 
 
 def train(name, seed, before=None):
-    """One run, unless its file is there; returns why there is none now, or None. `before` is waited for: a future."""
+    """Do one run after the future `before`, unless its file is there. Returns why it failed, or None."""
     path, peer = result(name, seed), PEERS[name]
     if before:
         before.result()
@@ -114,7 +115,7 @@ def train_all(at_once, rows=None):
 
 
 def read(path):
-    """What a run wrote; ValueError names a file that is something else."""
+    """The numbers that a run wrote. Raises ValueError that names a file of another kind."""
     try:
         run = json.loads(path.read_text())
         return {"curve": run["curve"], "final": run["final"]}
@@ -123,7 +124,7 @@ def read(path):
 
 
 def table():
-    """Rows with different figures have headers of their own."""
+    """The lines of the table. Rows with other numbers have their own header."""
     lines, keys = [], None
     for name, peer in PEERS.items():
         paths = [result(name, seed) for seed in peer.seeds]

@@ -2,7 +2,7 @@
 
     python benchmarks/robustness.py [--kills 50] [--fuzz 10000] [--soak 2000] [--seed 0]
 
-Prints what was tried and how it ended; the first failure is an AssertionError. The tests do the same, fewer times.
+Prints what was tried and how it ended. The first failure is an AssertionError. The tests do the same, but fewer times.
 """
 
 from __future__ import annotations
@@ -90,9 +90,9 @@ def finish(folder, *argv):
 
 
 def kill_and_resume(kills, seed=0):
-    """SIGKILL runs at random moments, every other time in the middle of a write, and resume; the count of each.
+    """SIGKILL runs at random moments, every other time in the middle of a write, and resume. Returns the counts.
 
-    The run that was resumed must end with the bits of the uninterrupted one. Killed before its first checkpoint, it
+    A resumed run must end with the bits of the uninterrupted run. A run that is killed before its first checkpoint
     begins anew.
     """
     rng, ended = np.random.default_rng(seed), Counter()
@@ -128,7 +128,7 @@ def kill_and_resume(kills, seed=0):
 
 
 def outcome(call, *inputs):
-    """'works', or 'refused' if it ends with one line that begins with "error: "; everything else is raised."""
+    """'works', or 'refused' if it ends with one line that begins with "error: ". Everything else is raised."""
     errors = io.StringIO()
     try:
         with contextlib.redirect_stderr(errors), contextlib.redirect_stdout(io.StringIO()):
@@ -315,7 +315,7 @@ def resources():
 
 
 def living_tensors():
-    """Their number in this process; to look through all objects takes half a second."""
+    """The number of tensors in this process. Looking through all objects takes half a second."""
     gc.collect()
     return sum(issubclass(type(thing), torch.Tensor) for thing in gc.get_objects())
 
@@ -338,7 +338,7 @@ def soak_in_child(pipe, argv):
 def soak(updates):
     """Train for so many tiny updates: resident memory (bytes), open files and, each hundredth, living tensors.
 
-    AssertionError says after how many of them the child died, if it did.
+    Raises AssertionError if the child dies, with the number of updates until then.
     """
     ours, theirs = PROCESSES.Pipe(duplex=False)
     process = PROCESSES.Process(target=soak_in_child, args=(theirs, [*TINY, f"--total-updates={updates}"]))

@@ -1,4 +1,4 @@
-"""Train a list of runs, some at a time; what is finished is skipped, what was cut goes on, and all is published.
+"""Train a list of runs, some at a time, and publish them. Finished runs are skipped, and interrupted ones go on.
 
     python benchmarks/run_seeds.py jobs.txt [--at-once 2] [--numbers]
 
@@ -7,11 +7,11 @@ Each line of jobs.txt is a results folder and the command that trains for it; em
     results/my_di  ppo_gtrxl_di.py --seed 1 --num-threads 1
     results/my_di  ppo_gtrxl_di.py --seed 2 --num-threads 1
 
-With --numbers the results folders get the evaluations and curves alone: no weights, no figures.
+With --numbers the results folders get only evaluations and curves, no weights and no figures.
 
-A run in runs/ belongs to a line if it has the same arguments, so nothing else is kept: start it again after a power
-cut and it does the rest. Each run's output is added to a log in runs/, named after its folder and seed. Exit status 1
-if a run failed or could not be published; the others go on. Ctrl-C and SIGTERM end the runs, too, which are saved.
+A run in runs/ belongs to a line if it has the same arguments. So after a power cut the same command does the rest. Each
+run's output is added to a log in runs/, named after its folder and seed. The exit status is 1 if a run failed or could
+not be published. The other runs go on. Ctrl-C and SIGTERM also end the runs, which save their state.
 """
 
 from __future__ import annotations
@@ -40,27 +40,28 @@ MACHINE = ("cuda", "num_threads", "resume")  # arguments that another start may 
 
 @dataclass
 class Job:
-    results: Path  # the folder that it is published to
+    results: Path  # the folder to which it is published
     command: list[str]  # script and flags
-    args: dict  # the script's arguments that follow from them
+    args: dict  # the script's arguments with these flags
 
     def run_dir(self):
         """The newest run in runs/ that has the arguments of this job, or None."""
         mine = {name: value for name, value in self.args.items() if name not in MACHINE}
         for path in sorted(Path("runs").glob("*/args.json"), key=lambda path: path.stat().st_mtime, reverse=True):
-            theirs = read_args(path)
-            if mine == {name: value for name, value in theirs.items() if name not in MACHINE}:
+            others = read_args(path)
+            if mine == {name: value for name, value in others.items() if name not in MACHINE}:
                 return path.parent
         return None
 
     def is_trained(self):
-        """Whether its evaluation is whole: eval.json is written after eval.npz."""
+        """Whether it has a whole evaluation, with eval.json, which is written last, and eval.npz."""
         run = self.run_dir()
         return run is not None and all((run / name).exists() for name in ("eval.json", "eval.npz"))
 
     def start(self):
-        """Begin it, or go on with it where a run of it was saved."""
-        run, (script, *flags) = self.run_dir(), self.command
+        """Begin the job, or go on with its saved run."""
+        run = self.run_dir()
+        script, *flags = self.command
         if run is not None and (run / "training_state.pt").exists():
             flags = ["--resume", str(run), "--num-threads", str(self.args["num_threads"])]
         Path("runs").mkdir(exist_ok=True)
@@ -68,15 +69,17 @@ class Job:
             return subprocess.Popen([sys.executable, ROOT / script, *flags], stdout=log, stderr=subprocess.STDOUT)
 
     def publish(self, numbers):
-        """Add the run, or its numbers alone, to its results folder, unless all of it is there already.
+        """Add the run, or only its numbers, to its results folder, unless all of it is there already.
 
-        What the folder ships is replaced if it is another run of this seed. OSError or ValueError says what is missing.
+        The shipped policy is replaced if it is of another run of this seed. Raises OSError or ValueError that says what
+        is missing.
         """
-        run, shipped = self.run_dir(), self.results / "eval.json"
+        run = self.run_dir()
+        shipped = self.results / "eval.json"
         if run is None:
             raise ValueError("runs/ holds no run with these arguments")
         ship = shipped.exists() and read_json(shipped)["seed"] == self.args["seed"]
-        ships = not numbers and (ship or not shipped.exists())  # a folder that ships none ships what comes first
+        ships = not numbers and (ship or not shipped.exists())  # an empty folder ships the first run
         if not self.has_numbers(run) or (ships and not self.is_shipped(run)):
             evaluate.publish(run, self.results, ship=ship, numbers=numbers)
 
@@ -96,7 +99,7 @@ def same(path, other):
 
 
 def read_args(path):
-    """A run's arguments; none of a file that is damaged, which is printed: it can be that of any other run."""
+    """A run's arguments, {} for a damaged file. This is printed, because the file may be that of any run."""
     try:
         args = json.loads(path.read_text())
         if not isinstance(args, dict):
@@ -113,11 +116,12 @@ def print_once(line):
 
 
 def read_jobs(path):
-    """The jobs of a file; ValueError names the line that cannot be one."""
+    """The jobs of a file. Raises ValueError that names a line which is no job."""
     jobs = []
     for number, line in enumerate(Path(path).read_text().splitlines(), start=1):
         try:
-            if words := shlex.split(line, comments=True):
+            words = shlex.split(line, comments=True)
+            if words:
                 jobs.append(read_job(words))
         except (OSError, ValueError, SystemExit) as error:
             raise ValueError(f"{path}, line {number}: {str(error).removeprefix('error: ')}") from error
@@ -125,7 +129,7 @@ def read_jobs(path):
 
 
 def read_job(words):
-    """The job of a line; ValueError, OSError or SystemExit says why it cannot be one."""
+    """The job of a line. Raises ValueError, OSError or SystemExit that says why it is none."""
     if len(words) < 2 or words[1] not in SCRIPTS:
         raise ValueError(f"{shlex.join(words)!r} must be a results folder, one of {', '.join(SCRIPTS)} and its flags")
     results, script, *flags = words
@@ -139,7 +143,7 @@ def read_job(words):
 
 
 def publish(job, numbers):
-    """Publish a job's run, and whether that worked: a line is printed where it failed, and the other jobs go on."""
+    """Publish a job's run. Returns whether that worked. A failure prints a line, and the other jobs go on."""
     try:
         job.publish(numbers)
     except (OSError, ValueError) as error:
@@ -149,14 +153,15 @@ def publish(job, numbers):
 
 
 def next_free(waiting, running):
-    """The first waiting job whose run no running one has, or None: it would go on with it."""
+    """The first waiting job that would not go on with the run of a running job, or None."""
     busy = {job.run_dir() for job in running}
     return next((job for job in waiting if job.run_dir() is None or job.run_dir() not in busy), None)
 
 
 def work(jobs, at_once, numbers):
-    """Train the jobs, `at_once` at a time, and publish each as it ends; returns those that failed."""
-    waiting, running = [job for job in jobs if not job.is_trained()], []
+    """Train the jobs, `at_once` at a time, and publish each when it ends. Returns those that failed."""
+    waiting = [job for job in jobs if not job.is_trained()]
+    running = []
     print(f"{len(jobs)} jobs, {len(jobs) - len(waiting)} trained already", flush=True)
     failed = [job for job in jobs if job not in waiting and not publish(job, numbers)]
     try:
@@ -180,8 +185,8 @@ def work(jobs, at_once, numbers):
 
 
 def main():
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell ignores it for what it starts in the background
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that `work` ends what it has started
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell sets it to be ignored in the background
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that `work` ends the runs that it has started
     parser = OneLineParser(description=__doc__.splitlines()[0])
     parser.add_argument("jobs", help="file with one run a line")
     parser.add_argument("--at-once", type=integer(1, 64), default=1, help="number of runs at a time")

@@ -1,13 +1,13 @@
-"""Whether the code of every result trains as today's: its command, cut to a few updates, by each, to the last bit.
+"""Whether the code of every result and that of HEAD train to the same bits, by its command cut to a few updates.
 
     python benchmarks/same_training.py                          # every result: some 20 minutes of one core
     python benchmarks/same_training.py results/di --updates 20
 
-results/commits.json says by which commit each seed was trained. The first of a result's commands, cut to `--updates`
-(schedules are over a training's updates, so all of them falls into it), is run by the code of each of these commits
-and by that of HEAD, each taken out of git into a temporary folder. Prints a line for each; exit status 1 if one bit of
-what was learned differs. What is flown is these weights' average, and no part of the training. Table 1's long runs are
-not compared: the code that trained them has other flags.
+results/commits.json names the commit that trained each seed. The code of each of these commits, and that of HEAD, is
+taken out of git into a temporary folder and runs the first of the result's commands, cut to `--updates`. Schedules are
+over a training's updates, so a cut training goes through the whole schedule. Prints a line for each commit. The exit
+status is 1 if one bit of the weights differs. The averaged weights are not compared, because they are no part of the
+training. Table 1's long runs are not compared, because the code that trained them has other flags.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ JOBS = ROOT / "benchmarks" / "result_jobs.txt"
 
 
 def checkout(commit, folder):
-    """The files of a commit in an empty folder; OSError if git has no such commit."""
+    """Put the files of a commit into an empty folder. Raises OSError if git has no such commit."""
     archive = folder.with_suffix(".zip")
     got = subprocess.run(["git", "archive", "--output", archive, commit], cwd=ROOT, stderr=subprocess.PIPE, text=True)
     if got.returncode:
@@ -42,7 +42,7 @@ def checkout(commit, folder):
 
 
 def train(command, folder, updates):
-    """What a command cut to `updates` learns, by name, by the code in a folder; RuntimeError if it fails."""
+    """{name: weight} that a command cut to `updates` learns by a folder's code. Raises RuntimeError if it fails."""
     script, *flags = command
     runs = set((folder / "runs").glob("*"))
     cut = [sys.executable, script, *flags, "--total-updates", str(updates)]
@@ -54,29 +54,29 @@ def train(command, folder, updates):
 
 
 def bits(weight):
-    """All that makes two weights the same, NaN and the sign of zero included."""
+    """A weight's type, shape and bytes, which tell NaN and the sign of zero apart."""
     return weight.dtype, weight.shape, weight.numpy().tobytes()
 
 
 def differing(one, other):
-    """How many of the weights by name are not the same bits."""
+    """The number of weights by name that have other bits, or are only on one side."""
     of_both = one.keys() & other.keys()
     return len(one.keys() ^ other.keys()) + sum(bits(one[name]) != bits(other[name]) for name in of_both)
 
 
 def first_jobs():
-    """The first line of each results folder: folder -> command."""
+    """{results folder: command} of each folder's first line."""
     return {str(job.results): job.command for job in reversed(run_seeds.read_jobs(JOBS))}
 
 
 def compare(name, command, commits, updates, temporary):
-    """Train a result's command by HEAD and by each commit, print a line for each; whether all gave the same bits."""
+    """Train a result's command by HEAD and by each commit, and print a line for each. Whether all bits are the same."""
     found = {}
     for commit in ("HEAD", *commits):
         folder = temporary / commit
         if not folder.exists():
             checkout(commit, folder)
-        if commit != "HEAD":  # what begins with a policy begins with the same one
+        if commit != "HEAD":  # a training that begins with a policy must begin with the same one
             for policy in (temporary / "HEAD" / "results").glob("*/agent.safetensors"):
                 shutil.copy(policy, folder / "results" / policy.parent.name)
         found[commit] = train(command, folder, updates)
@@ -93,7 +93,8 @@ def main():
     parser.add_argument("--updates", type=integer(1, 10**6), default=6, help="updates of each training")
     options = parser.parse_args()
     commits = json.loads(COMMITS.read_text())
-    if unknown := sorted(set(options.results) - commits.keys()):
+    unknown = sorted(set(options.results) - commits.keys())
+    if unknown:
         sys.exit(f"error: results {', '.join(unknown)} must be among {', '.join(commits)}")
     try:
         with tempfile.TemporaryDirectory() as folder:

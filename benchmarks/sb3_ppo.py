@@ -5,11 +5,11 @@
     python benchmarks/sb3_ppo.py --env-id RocketAscentCutoff-v0 --batch-size 512 --learning-rate 1e-3
     python benchmarks/sb3_ppo.py --env-id RocketAscentCutoff-v0 --recurrent --dispersion 1 --start RUN.zip
 
-It is given what our script gives its own learner: the curriculum (scale of R_terminal), the first mean action and its
-noise, the local frame, and our features of the observation (of dispersed flights beside the nominal one, too), or with
---features raw the observation itself; propellant has a price by the kilogram. The rest is that library's: feed-forward
-networks for actor and critic (an LSTM with --recurrent, of sb3-contrib), VecNormalize of inputs and rewards, its
-discount, clipping and epochs. `peers.py` runs and lists all.
+It gets what our script gives its own learner: the curriculum (scale of R_terminal), the first mean action and its
+noise, the local frame, and our features of the observation, for dispersed flights with the differences from the nominal
+flight. With --features raw it gets the observation itself. Propellant has a price by the kilogram. The rest is that
+library's: feed-forward networks for actor and critic (with --recurrent an LSTM of sb3-contrib), VecNormalize of inputs
+and rewards, its discount, clipping and epochs. `peers.py` runs and lists all.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ SCRIPTS = ("ppo_gtrxl_di", "ppo_gtrxl_vdp", "ppo_gtrxl_rocket")
 
 
 class OurFeatures(VecEnvWrapper):
-    """Observations as our script's encoder sees them; `raw` are the environments' last ones (N, obs)."""
+    """Observations as our script's encoder sees them. `raw` are the environments' last observations (N, obs)."""
 
     def __init__(self, venv, script, env_id):
         constants = {name: torch.tensor(value) for name, value in script.BUFFERS[env_id].items()}
@@ -68,11 +68,11 @@ class OurFeatures(VecEnvWrapper):
 
 
 class OurCurriculum(BaseCallback):
-    """Before each rollout, what our script changes by the share of training done, and the price of propellant.
+    """Before each rollout, set what our script changes by the share of training done, and the price of propellant.
 
-    Ours compares the masses of flights that have all ended (`add_rewards`). This library's rollouts end in the midst
-    of flights, so here propellant costs by the kilogram, as it did in our script before d1455f1: nothing in the first
-    quarter, most at 60 %, a tenth of that at the end.
+    Our script compares the masses of flights that have all ended (`add_rewards`). This library's rollouts end in the
+    middle of flights, so here propellant has a price by the kilogram. It is zero in the first quarter, highest at 60 %,
+    and a tenth of that at the end.
     """
 
     def __init__(self, script, args, batch, samples):
@@ -93,7 +93,7 @@ class OurCurriculum(BaseCallback):
 
 
 class OurNominalFlight(BaseCallback):
-    """When a dispersed training begins, what our script does then: the nominal flight is flown, and kept."""
+    """When a dispersed training begins, fly the nominal flight and keep it, as our script does."""
 
     def __init__(self, script, env_id, env_options, seen):
         super().__init__()
@@ -123,16 +123,16 @@ class OurNominalFlight(BaseCallback):
 
 
 def input_weights(policy):
-    """The weights (width, inputs) with which actor and critic begin."""
+    """The first weights (width, inputs) of actor and critic."""
     if hasattr(policy, "lstm_actor"):
         return [policy.lstm_actor.weight_ih_l0, policy.lstm_critic.weight_ih_l0]
     return [policy.mlp_extractor.policy_net[0].weight, policy.mlp_extractor.value_net[0].weight]
 
 
 class Evaluation(BaseCallback):
-    """Evaluates after each part of the samples, dispersed flights on as many draws as ours.
+    """Evaluates after each part of the samples, with as many draws of dispersed flights as our script.
 
-    `curve` has the processor's minutes of all but that.
+    `curve` has the processor's minutes, without those of the evaluations.
     """
 
     def __init__(self, env_id, env_options, samples):
@@ -184,7 +184,7 @@ def make_policy(model, normalised):
 def make_model(options, script, args, normalised, steps):
     """The library's learner with our first mean action and its noise, or with the parameters of --start.
 
-    Like our script it goes on with the noise of --start, unless --log-std says otherwise.
+    Like our script it keeps the noise of --start, unless --log-std says otherwise.
     """
     kind, policy = (RecurrentPPO, "MlpLstmPolicy") if options.recurrent else (PPO, "MlpPolicy")
     width = {"lstm_hidden_size": 64} if options.recurrent else {}

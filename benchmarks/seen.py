@@ -1,11 +1,11 @@
-"""How far dispersed flights differ from the nominal one, and how much of what they miss could be told from that.
+"""How far dispersed flights differ from the nominal one, and how much of their miss these differences predict.
 
     python benchmarks/seen.py results/rocket_dispersed/agent.safetensors
 
 Flies the mean action on 341 draws. Every 100 s, and 40 and 10 s before the first flight ends, it prints the standard
-deviation of each of the eight differences in the sizes of `DIFFERENCES`: a vehicle whose flights differ by far more or
-less wants other sizes. Beside it stands the part of the variance of each element's final miss that is a linear function
-of the differences (R squared).
+deviation of each of the eight differences, in the units of `DIFFERENCES`. A vehicle whose flights differ by far more or
+less needs other units. Beside it is the part of the variance of each element's final miss that is a linear function of
+the differences (R squared).
 """
 
 from __future__ import annotations

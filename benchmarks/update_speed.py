@@ -5,10 +5,12 @@
     python benchmarks/update_speed.py --compile            # what --torch-compile brings
     python benchmarks/update_speed.py --growth results/update_speed.png
 
-Each size runs in a process of its own, so that its peak memory is its own. Printed are the seconds of a rollout and of
-a PPO epoch, the rollout's share of an update, the epoch's FLOP (`flop_of_epoch`, and what torch counts), their rate
-over that of the same matrix products alone, and the epoch of the straightforward implementation that the public
-PPO-Transformer-XL codes use: every sample with a copy of its own window, whose keys and values are projected again.
+Each size runs in its own process, so that its peak memory can be measured. It prints
+
+- the seconds of a rollout and of a PPO epoch, and the rollout's share of an update
+- the epoch's FLOP (`flop_of_epoch`, and torch's count), and their rate over that of the same matrix products alone
+- the epoch of the straightforward implementation of the public PPO-Transformer-XL codes, in which every sample has a
+  copy of its window, whose keys and values are projected again
 """
 
 from __future__ import annotations
@@ -59,7 +61,7 @@ def timed(function):
 
 
 def median(values):
-    """The middle one, of an even number the higher of two."""
+    """The middle value. Of an even number of values it is the higher of the two middle ones."""
     return sorted(values)[len(values) // 2]
 
 
@@ -186,7 +188,7 @@ def agent_features(agent, obs):
 
 
 def encode_gathered(agent, obs, windows):
-    """Samples one by one: obs (B, obs), windows (blocks, B, L, d) -> hidden (B, d). No gradient into the memory."""
+    """Encode single samples: obs (B, obs), windows (blocks, B, L, d) -> hidden (B, d). The memory has no gradient."""
     x = agent.encoder(agent_features(agent, obs))
     for block, window in zip(agent.blocks, windows):
         attention, heads = block.attention, block.attention.num_heads
@@ -229,7 +231,7 @@ def gathered_epoch(bench, batch, samples):
 
 
 def measure(size, threads, repeats, pipe=None, changes=None):
-    """All figures of one size."""
+    """All numbers of one size."""
     keep_memory()
     torch.set_num_threads(threads)
     script, preset = SIZES[size]

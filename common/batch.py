@@ -1,4 +1,4 @@
-"""What every environment shares: the batch of N flights, and the single environment as a view of a batch of one."""
+"""The base of all environments: the batch of N flights, and the single environment as a view of a batch of one."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ AUTORESET_MODES = (AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP)
 
 
 class Sealed:
-    """An environment that takes no attribute which it does not have: a misspelt one would do nothing, silently."""
+    """An environment that refuses new public attributes, because a misspelt attribute would silently do nothing."""
 
     _is_sealed = False
 
     def sealed(self):
-        """This environment, from here on without new public attributes."""
+        """Seal this environment against new public attributes, and return it."""
         self._is_sealed = True
         return self
 
@@ -41,31 +41,35 @@ class Sealed:
 
 
 class BatchedEnv(Sealed, VectorEnv):
-    """What every problem shares: step counters, checks of the action, and autoreset.
+    """The base of every problem's batch: step counters, checks of the action, and autoreset.
 
-    With `autoreset_mode` "SameStep", the default, an episode that ends is followed by the next one's first observation
-    in the same step; its own last values are `final_obs` and `final_info`. With "NextStep", as some of Gymnasium's
-    vector wrappers expect it, that step returns the episode's last observation and, in the info, its last values. The
-    step after it ignores that environment's action and returns the next episode's first observation, with reward 0.
+    With `autoreset_mode` "SameStep", the default, the step in which an episode ends returns the next episode's first
+    observation. The ended episode's last values are `final_obs` and `final_info`. Some of Gymnasium's vector wrappers
+    expect "NextStep". Then that step returns the episode's last observation, and its last values in the info. The next
+    step ignores that environment's action and returns the next episode's first observation, with reward 0.
     https://farama.org/Vector-Autoreset-Mode
 
-    A problem gives the spaces, `episode_steps` (the longest episode) and three methods:
-    `_start(mask, options)` puts the environments in `mask` at a start, `_observe()` returns (N, obs) float64, and
-    `_advance(actions)` flies one step and returns `(rewards (N,), terminated (N,), final)`, where `final()` gives the
-    `final_info` arrays of the finished episodes; it is only called when there is one. One that can be rendered has
-    `RENDERED` in its `metadata` and two more: `_snapshot()` returns time (N,) s, the control of the step before (N, m)
-    and state (N, n), arrays of their own; `_make_sheet()` returns the drawing, whose `frame(t, u, y)` is a flight's
-    picture.
+    A problem gives the spaces, `episode_steps` (of the longest episode) and three methods:
 
-    Every problem has more attributes: `dt`, the step in s (1 unless given); `phase` (N,), the 0-based phase in which
-    the running steps begin (0 unless given); and `observation_scale`, a usual size of each observation (1 unless
-    given), by which the networks of our scripts divide it.
+    - `_start(mask, options)` puts the environments in `mask` at a start
+    - `_observe()` returns (N, obs) float64
+    - `_advance(actions)` flies one step and returns `(rewards (N,), terminated (N,), final)`; `final()` gives the
+      `final_info` arrays of the finished episodes, and is called only if there are any
 
-    With the attribute `flights_per_start` G, to be set before a `reset` and only in training, environment k flies start
-    k // G, so that flights differ by their actions alone (1: each flies its own start; the last group is smaller where
-    G does not divide N). A dispersed rocket's start is its vehicle and air; of two groups the second has the first
-    one's draw, its signs changed (antithetic variates). This is promised of the episodes that begin at a `reset`, and
-    our scripts train on no others: an autoreset groups the environments that ended in its step, whatever their k.
+    A problem that can be rendered has `RENDERED` in its `metadata` and two more methods:
+
+    - `_snapshot()` returns new arrays: time (N,) in s, the last control (N, m) and state (N, n)
+    - `_make_sheet()` returns the drawing, whose `frame(t, u, y)` is a flight's picture
+
+    Every problem has three attributes with a default: `dt`, the step in s (1); `phase` (N,), the 0-based phase in which
+    the running steps begin (0); and `observation_scale`, a usual size of each observation (1), by which the networks of
+    our scripts divide the observation.
+
+    Training may set `flights_per_start` G before a `reset`. Then environment k flies start k // G, so the flights of a
+    group differ only by their actions. With 1 each environment flies its own start. The last group is smaller if G does
+    not divide N. A dispersed rocket's start is its vehicle and air, and every second group has the draw of the group
+    before it with the signs changed (antithetic variates). This holds for the episodes that begin at a `reset`, and our
+    scripts train only on these. An autoreset groups the environments that ended in the same step, for any k.
     """
 
     metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
@@ -92,12 +96,12 @@ class BatchedEnv(Sealed, VectorEnv):
             allowed = " or ".join(repr(mode.value) for mode in AUTORESET_MODES)
             raise ValueError(f"autoreset_mode is {autoreset_mode!r}; it must be {allowed}")
         self.metadata = {**self.metadata, "autoreset_mode": AutoresetMode(autoreset_mode)}
-        self._waiting = np.zeros(num_envs, dtype=bool)  # with NextStep: whose episode ended in the step before
+        self._waiting = np.zeros(num_envs, dtype=bool)  # with NextStep: the episodes that ended in the last step
         if render_mode not in (None, *self.metadata["render_modes"]):
             allowed = ", ".join(["None", *self.metadata["render_modes"]])
             raise ValueError(f"render_mode is {render_mode!r}; it must be one of {allowed}")
         self.render_mode, self._sheet = render_mode, None
-        self._trails = [[] for _ in range(num_envs)]  # of each running episode, only where it is rendered
+        self._trails = [[] for _ in range(num_envs)]  # the records of the running episodes, only with a render mode
         self.num_envs, self.episode_steps = num_envs, episode_steps
         self.single_observation_space = single_observation_space
         self.single_action_space = single_action_space
@@ -116,7 +120,7 @@ class BatchedEnv(Sealed, VectorEnv):
 
     @property
     def generators(self) -> dict[str, np.random.Generator]:
-        """The streams of random numbers, by name: a resumed training puts the states of all of them back."""
+        """The streams of random numbers, by name. A resumed training restores the states of all of them."""
         return {"envs": self.np_random}
 
     @property
@@ -125,7 +129,7 @@ class BatchedEnv(Sealed, VectorEnv):
         return np.zeros(self.num_envs, dtype=np.int64)
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
-        """Start every environment anew; returns (N, obs) float64 and an empty info."""
+        """Start every environment anew. Returns (N, obs) float64 and an empty info."""
         super().reset(seed=seed)
         self._restart(np.ones(self.num_envs, dtype=bool), options)
         self._waiting[:] = False
@@ -133,7 +137,7 @@ class BatchedEnv(Sealed, VectorEnv):
         return self._observe(), {}
 
     def step(self, actions):
-        """Fly one step and restart what ended, in this step or, with `autoreset_mode` "NextStep", in the next one."""
+        """Fly one step. Ended episodes restart in this step, or in the next one with `autoreset_mode` "NextStep"."""
         if self.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP:
             return self._step_and_wait(actions)
         obs, rewards, terminated, final = self.advance(actions)
@@ -150,7 +154,7 @@ class BatchedEnv(Sealed, VectorEnv):
         """`step` with autoreset in the next step."""
         begins = self._waiting.copy()
         if begins.any():
-            self._restart(begins, None)  # they are flown along, and put back to a start behind that
+            self._restart(begins, None)  # they fly this step with the others, and are put back to a start after it
             if np.shape(actions) == self.action_space.shape:
                 actions = np.where(begins[:, None], 1.0, actions)
         obs, rewards, terminated, final = self.advance(actions)
@@ -166,12 +170,12 @@ class BatchedEnv(Sealed, VectorEnv):
         return obs, rewards, terminated.copy(), np.zeros(self.num_envs, dtype=bool), info
 
     def __getstate__(self):
-        return {**self.__dict__, "_sheet": None}  # a drawing cannot be copied, and is made anew
+        return {**self.__dict__, "_sheet": None}  # a drawing cannot be copied, so the copy makes its own
 
     def advance(self, actions):
         """Fly one step without autoreset: `(obs, rewards, terminated, final_info)`.
 
-        BadInput names a bad action; ResetNeeded where there was no reset yet.
+        Raises BadInput for a bad action, and ResetNeeded before the first reset.
         """
         if not self._was_reset:
             raise ResetNeeded("no episode is running: call reset() first")
@@ -190,9 +194,9 @@ class BatchedEnv(Sealed, VectorEnv):
         return self._observe(), rewards, terminated, final() if terminated.any() else {}
 
     def render(self):
-        """The running episodes so far, a tuple of N frames, uint8 (H, W, 3); without a render mode a warning and None.
+        """The running episodes so far, a tuple of N frames, uint8 (H, W, 3). Without a render mode a warning and None.
 
-        An episode that has just ended is the next one already, as autoreset in the same step has it.
+        With autoreset in the same step, an episode that has just ended is already the next one.
         """
         if self.render_mode is None:
             warn_of_no_mode(self)
@@ -204,9 +208,9 @@ class BatchedEnv(Sealed, VectorEnv):
         return tuple(self._sheet.frame(t, u[1:], y) for t, u, y in columns)
 
     def _draw_starts(self, draw, count):
-        """Starts (count, k) of episodes that begin together, each `flights_per_start` in a row; `draw(n)` draws n.
+        """Starts (count, k) of episodes that begin together. Each is repeated `flights_per_start` times in a row.
 
-        At a `reset`, where all begin, row k is environment k's.
+        `draw(n)` draws n starts. At a `reset`, when all episodes begin, row k is that of environment k.
         """
         group = self.flights_per_start
         if not (isinstance(group, int | np.integer) and group >= 1):
@@ -214,7 +218,7 @@ class BatchedEnv(Sealed, VectorEnv):
         return np.repeat(draw(-(-count // group)), group, axis=0)[:count]  # rounded up
 
     def _restart(self, mask, options):
-        self._start(mask, options or {})  # first: it may refuse the options
+        self._start(mask, options or {})  # comes first, because it may refuse the options
         self.t[mask] = 0
         if self.render_mode is not None:
             for k in np.flatnonzero(mask):
@@ -222,14 +226,14 @@ class BatchedEnv(Sealed, VectorEnv):
             self._record(mask)
 
     def _record(self, mask):
-        """Add time, control of the step before, and state to the trails of the environments in `mask`."""
+        """Add time, last control and state to the trails of the environments in `mask`."""
         time, control, state = self._snapshot()
         for k in np.flatnonzero(mask):
             self._trails[k].append((time[k], control[k], state[k]))
 
 
 def warn_of_no_mode(env):
-    """Gymnasium's usual warning where `render` is called without a render mode."""
+    """Gymnasium's usual warning for a call of `render` without a render mode."""
     env_id = env.spec.id if env.spec else "id"
     gym.logger.warn(
         "You are calling render method without specifying any render mode. You can specify the render_mode at "
@@ -240,7 +244,7 @@ def warn_of_no_mode(env):
 class SingleEnv(Sealed, gym.Env):
     """One environment: a thin view of a batch of one (`batch`), without its autoreset.
 
-    A step without a reset before it, also the one after an episode's end, raises `gymnasium.error.ResetNeeded`.
+    A step before a reset, or after an episode's end, raises `gymnasium.error.ResetNeeded`.
     """
 
     def __init__(self, batch: BatchedEnv):
@@ -250,9 +254,9 @@ class SingleEnv(Sealed, gym.Env):
         self.observation_space, self.action_space = batch.single_observation_space, batch.single_action_space
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
-        """Start anew, `options` being the batch's without its first axis; returns the observation and an empty info."""
+        """Start anew. Returns the observation and an empty info. `options` are the batch's without their first axis."""
         super().reset(seed=seed)
-        self._running = False  # also where the options are refused
+        self._running = False  # stays so if the options are refused
         if options and "x0" in options:
             options = {**options, "x0": np.asarray(options["x0"])[None]}
         for name in ("draw", "noise"):
@@ -263,7 +267,7 @@ class SingleEnv(Sealed, gym.Env):
         return obs[0], info
 
     def step(self, action):
-        """Fly one step; the last one's info holds what `final_info` holds in the batch."""
+        """Fly one step. The last step's info has the entries of the batch's `final_info`."""
         if not self._running:
             raise ResetNeeded("no episode is running: call reset() first, and again after an episode has ended")
         obs, rewards, terminated, final = self.batch.advance(np.asarray(action)[None])
@@ -271,7 +275,7 @@ class SingleEnv(Sealed, gym.Env):
         return obs[0], float(rewards[0]), bool(terminated[0]), False, {key: value[0] for key, value in final.items()}
 
     def render(self):
-        """The episode so far, uint8 (H, W, 3); without a render mode a warning and None."""
+        """The episode so far, uint8 (H, W, 3). Without a render mode a warning and None."""
         if self.render_mode is None:
             warn_of_no_mode(self)
             return None
@@ -280,12 +284,19 @@ class SingleEnv(Sealed, gym.Env):
 
 
 def of_batch(name: str, doc: str) -> property:
-    """A property of a single environment that is its batch's."""
-    return property(lambda env: getattr(env.batch, name), lambda env, value: setattr(env.batch, name, value), doc=doc)
+    """A property of a single environment that reads and sets its batch's attribute."""
+
+    def read(env):
+        return getattr(env.batch, name)
+
+    def write(env, value):
+        setattr(env.batch, name, value)
+
+    return property(read, write, doc=doc)
 
 
 def check_options(environment: type, options: dict, *others: str):
-    """BadInput for an option that is neither of an environment's constructor nor among the `others`."""
+    """Raise BadInput for an option that is neither an argument of an environment's constructor nor in `others`."""
     given_otherwise = ("num_envs", "problem", "mission")
     taken = [name for name in inspect.signature(environment).parameters if name not in given_otherwise]
     allowed = [*taken, *others]
@@ -294,19 +305,20 @@ def check_options(environment: type, options: dict, *others: str):
 
 
 def refuse_autoreset(options: dict):
-    """BadInput where a single environment is asked for an autoreset: it has none."""
+    """Raise BadInput if a single environment is asked for an autoreset, which it does not have."""
     mode = options.get("autoreset_mode")
     allowed = "must not be given: a single environment is reset by its user; use gym.make_vec"
     refuse_unless(mode is None, "autoreset_mode", repr(mode), allowed)
 
 
 def make_batch(env_id: str, num_envs: int, **env_options) -> BatchedEnv:
-    """N environments of an id, with those options that it takes.
+    """N environments of an id, with the options that it takes. An option that is off may be one that it does not take.
 
-    Raises BadInput where it is not derived from `BatchedEnv`, or an option that it does not take would hide something.
+    Raises BadInput for other options, and for an environment that is not derived from `BatchedEnv`.
     """
     entry: Any = gym.spec(env_id).vector_entry_point
-    taken = inspect.signature(load_env_creator(entry) if isinstance(entry, str) else entry).parameters
+    make = load_env_creator(entry) if isinstance(entry, str) else entry
+    taken = inspect.signature(make).parameters
     takes_all = any(parameter.kind is inspect.Parameter.VAR_KEYWORD for parameter in taken.values())
     for name, value in env_options.items():
         refuse_unless(value or takes_all or name in taken, name, value, f"is no option of {env_id}; leave it out")

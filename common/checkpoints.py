@@ -1,7 +1,7 @@
-"""An agent.safetensors, read and made shorter without torch.
+"""Reading and shortening an agent.safetensors without torch.
 
-`runs.save_run` writes it: the averaged weights, last saved. A large network may be kept in bfloat16, which is a float32
-without its lower 16 bits: half the bytes, three digits.
+`runs.save_run` writes the averaged weights to it. A large network may be kept in bfloat16, which is a float32 without
+its lower 16 bits. It has half the bytes and three digits.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from common.errors import BadInput
 from common.files import write_bytes
 
 KINDS = {"F64": np.float64, "F32": np.float32, "F16": np.float16, "BF16": np.uint16, "I64": np.int64}
-LARGE = 10_000  # numbers of a tensor from which it is made shorter
+LARGE = 10_000  # a tensor of this many numbers or more is shortened
 COUNTERS = {"seed": int, "total_updates": int, "global_step": int, "training_seconds": float, "wall_seconds": float}
 
 
@@ -26,9 +26,12 @@ def read_checkpoint(
 ) -> dict:
     """An agent.safetensors: `args` (the run's arguments), `progress` (its counters), `tensors` (NumPy arrays).
 
-    `expected` gives the type of each argument that must be there, `env_ids` the environments that it may be of (none:
-    any), `defaults` what an older file need not hold. Raises BadInput, which begins with `flag` and the path, if the
-    file is missing, damaged or of something else, or holds a weight that is not finite.
+    - expected: the type of each argument that must be there
+    - env_ids: the environments that the file may be of; empty: any
+    - defaults: arguments that an older file need not have
+
+    Raises BadInput, which begins with `flag` and the path, if the file is missing, damaged or of something else, or if
+    a weight is not finite.
     """
     try:
         data = Path(path).read_bytes()
@@ -36,10 +39,11 @@ def read_checkpoint(
         metadata = read_metadata(data)
         args = {**(defaults or {}), **json.loads(metadata["args"])}
         env_id = args["env_id"]
-        if env_ids and isinstance(env_id, str) and env_id not in env_ids:  # another script's has other arguments, too
+        # this check comes first, because another script's file has other arguments, too
+        if env_ids and isinstance(env_id, str) and env_id not in env_ids:
             raise BadInput(f"{flag}{path}: is of {env_id}; this script takes {', '.join(env_ids)}")
         wrong = [name for name, kind in expected.items() if type(args[name]) is not kind]
-        metadata.setdefault("training_seconds", metadata["wall_seconds"])  # an older file counted no other time
+        metadata.setdefault("training_seconds", metadata["wall_seconds"])  # an older file has only this time
         progress = {name: kind(metadata[name]) for name, kind in COUNTERS.items()}
         if not all(math.isfinite(value) and value >= 0 for value in progress.values()):
             raise ValueError(f"its counters are {progress}")
@@ -58,15 +62,15 @@ def read_checkpoint(
 
 
 def read_metadata(data: bytes) -> dict[str, str]:
-    """The metadata of a safetensors file. KeyError where it has none."""
+    """The metadata of a safetensors file. Raises KeyError without metadata."""
     header = data[8 : 8 + int.from_bytes(data[:8], "little")]
     return json.loads(header)["__metadata__"]
 
 
 def read_tensors(data: bytes) -> dict[str, np.ndarray]:
-    """The arrays of a safetensors file by name. NumPy has no bfloat16: such an array is returned as float32.
+    """The arrays of a safetensors file by name. A bfloat16 array is returned as float32, because NumPy has no bfloat16.
 
-    KeyError for another kind of number than KINDS.
+    Raises KeyError for a kind of number that is not in KINDS.
     """
     tensors = {}
     for name, tensor in safetensors.deserialize(data):
@@ -78,9 +82,10 @@ def read_tensors(data: bytes) -> dict[str, np.ndarray]:
 
 
 def write_bfloat16(source, target):
-    """Write an agent.safetensors anew with its LARGE tensors rounded to bfloat16.
+    """Write an agent.safetensors again, with its LARGE tensors rounded to bfloat16.
 
-    Small ones stay as they are: rounding the problem's constants (units, axes) would cost more than all weights.
+    Small tensors stay as they are, because rounding the problem's constants (units, axes) would cost more accuracy than
+    rounding all weights.
     """
     data = Path(source).read_bytes()
     specs, arrays = {}, []
@@ -90,7 +95,7 @@ def write_bfloat16(source, target):
             kind = "bfloat16"
             bits = array.view(np.uint32)
             array = ((bits + 0x7FFF + ((bits >> 16) & 1)) >> 16).astype(np.uint16)  # to the nearest, ties to even
-        arrays.append(array)  # `serialize` reads their memory
+        arrays.append(array)  # keeps the memory that `serialize` reads
         specs[name] = safetensors.TensorSpec(
             dtype=kind, shape=array.shape, data_ptr=array.ctypes.data, data_len=array.nbytes
         )

@@ -1,4 +1,4 @@
-"""What the commands have in common: errors of one line, and types of arguments that are checked as they are read."""
+"""The base of all commands: errors of one line, and types of arguments that are checked when they are read."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 
 
 class OneLineParser(argparse.ArgumentParser):
-    """Errors are one line, without the usage above it."""
+    """A parser whose errors are one line, without the usage."""
 
     def error(self, message):
         sys.exit(f"error: {message}")
@@ -45,7 +45,7 @@ def number(low: float, high: float) -> Callable:
 
 
 def positive(text: str) -> float:
-    """Argument type: a dispersion that disperses."""
+    """Argument type: a dispersion above 0, at most 10."""
     try:
         value = float(text)
     except ValueError:
@@ -56,7 +56,7 @@ def positive(text: str) -> float:
 
 
 def output_file(text: str) -> Path:
-    """Argument type: a file to write, refused before anything is solved if that cannot work."""
+    """Argument type: a file to write. A file that cannot be written is refused before anything is solved."""
     path = Path(text)
     if path.is_dir() or not os.access(path.parent, os.W_OK):
         raise argparse.ArgumentTypeError(f"{text!r} must be a file in an existing, writable folder")
@@ -72,7 +72,7 @@ def named_path(text: str) -> tuple[str, Path]:
 
 
 def utc(text: str) -> datetime:
-    """Argument type: a moment, ISO 8601; in UTC unless it says otherwise."""
+    """Argument type: a moment in ISO 8601, in UTC unless it names another zone."""
     try:
         moment = datetime.fromisoformat(text)
     except ValueError as error:

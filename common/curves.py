@@ -10,7 +10,7 @@ from common.files import replacing
 
 
 def read_curve(run_dir) -> dict:
-    """The curve of a run from its TensorBoard events; a resumed run repeats steps, and the last value counts."""
+    """The curve of a run from its TensorBoard events. A resumed run repeats steps, and the last value counts."""
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     events = EventAccumulator(str(run_dir), size_guidance={"scalars": 0})
@@ -24,7 +24,7 @@ def read_curve(run_dir) -> dict:
 
 
 def write_csv(path, curve: dict):
-    """Write a curve: `global_step`, then one column a tag; an empty cell where a tag has no value at that step."""
+    """Write a curve: `global_step`, then one column for each tag. A cell is empty if a tag has no value there."""
     columns = {tag: dict(zip(steps.tolist(), values.tolist())) for tag, (steps, values) in curve.items()}
     with replacing(path, "w") as file:
         writer = csv.writer(file, lineterminator="\n")
@@ -35,13 +35,14 @@ def write_csv(path, curve: dict):
 
 
 def cell(value: float) -> str:
-    """A number as text: a whole one exactly, another by six digits, which draw the same curve."""
+    """A number as text. A whole number is exact. Another has six digits, which are enough to draw the same curve."""
     return f"{value:.0f}" if value == round(value) else f"{value:.6g}"
 
 
 def evaluated(curve: dict) -> dict:
-    """The part of a curve at the steps of its evaluations; the whole one where there are none."""
-    kept = np.unique(np.concatenate([np.empty(0), *(steps for tag, (steps, _) in curve.items() if tag[:5] == "eval/")]))
+    """The part of a curve at the steps of its evaluations. Without evaluations it is the whole curve."""
+    of_evaluations = [steps for tag, (steps, _) in curve.items() if tag[:5] == "eval/"]
+    kept = np.unique(np.concatenate([np.empty(0), *of_evaluations]))
     if not len(kept):
         return curve
     rows = {tag: np.isin(steps, kept) for tag, (steps, _) in curve.items()}
@@ -49,7 +50,7 @@ def evaluated(curve: dict) -> dict:
 
 
 def read_csv(path) -> dict:
-    """The curve that `write_csv` wrote; ValueError if the file is not such a table."""
+    """The curve that `write_csv` wrote. Raises ValueError if the file is not such a table."""
     with open(path, newline="") as file:
         header, *rows = list(csv.reader(file)) or [[]]
     try:

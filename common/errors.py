@@ -8,26 +8,26 @@ import numpy as np
 
 
 class BadInput(ValueError):
-    """A value or file that a user gave and nothing can be done with; its message is the one line that is shown."""
+    """A value or file of a user that cannot be used. Its message is the one line that is shown."""
 
 
 class NoOptimum(RuntimeError):
-    """A reference that was not found, or does not fly as it was solved; its message is one line."""
+    """A reference that was not found, or that does not fly as it was solved. Its message is one line."""
 
 
 def refuse_unless(possible, field: str, value, allowed: str):
-    """BadInput with one line that names the field, the value and what is allowed."""
+    """Raise BadInput with one line that names the field, the value and what is allowed, unless `possible`."""
     if not possible:
         raise BadInput(f"{field} is {value}; it {allowed}")
 
 
 def is_finite(value) -> bool:
-    """Whether it is a number, and not infinite."""
+    """Whether `value` is a finite number."""
     return isinstance(value, int | float | np.number) and bool(np.isfinite(value))
 
 
 def refuse_unless_finite(whose: str, table):
-    """BadInput for the first number of a dataclass that is not one, or is infinite."""
+    """Raise BadInput for the first float field of a dataclass that is not a finite number."""
     for field in fields(table):
         value = getattr(table, field.name)
         if field.type == "float":

@@ -1,4 +1,4 @@
-"""The two files of an evaluation, eval.json and eval.npz: written whole, checked when they are read."""
+"""The two files of an evaluation, eval.json and eval.npz. They are written whole and checked when they are read."""
 
 from __future__ import annotations
 
@@ -16,17 +16,18 @@ def sha256_of(path) -> str:
 
 
 def write_evaluation(metrics: dict, arrays: dict, checkpoint, json_path, npz_path):
-    """Write an evaluation of the file `checkpoint`, which `metrics` then names by its sha256; None writes nothing."""
+    """Write an evaluation of the file `checkpoint`, whose sha256 is added to `metrics`. A path None is not written."""
     metrics["checkpoint_sha256"] = sha256_of(checkpoint)
     if npz_path is not None:
         write_npz(npz_path, arrays)
-    if json_path is not None:  # last: a run with its eval.json is finished
+    if json_path is not None:  # written last, because a run with an eval.json counts as finished
         write_json(json_path, metrics)
 
 
 def read_evaluation(folder: Path) -> tuple[dict, dict]:
-    """The `metrics` and `arrays` of a run's or results folder; OSError or ValueError names the file that is bad."""
-    metrics, path = read_metrics(folder / "eval.json"), folder / "eval.npz"
+    """The `metrics` and `arrays` of a run or results folder. Raises OSError or ValueError that names the bad file."""
+    metrics = read_metrics(folder / "eval.json")
+    path = folder / "eval.npz"
     arrays = read_npz(path)
     missing = task_of(metrics["env_id"]).required_arrays(metrics) - arrays.keys()
     if missing:
@@ -35,7 +36,7 @@ def read_evaluation(folder: Path) -> tuple[dict, dict]:
 
 
 def read_metrics(path: Path) -> dict:
-    """An eval.json that holds all of its table; ValueError names the file and what is wrong with it."""
+    """An eval.json with all numbers of its table. Raises ValueError that names the file and what is wrong with it."""
     metrics = read_json(path)
     try:
         task_of(metrics["env_id"]).table(metrics)
@@ -45,7 +46,7 @@ def read_metrics(path: Path) -> dict:
 
 
 def read_json(path: Path) -> dict:
-    """The eval.json of a finished run; ValueError names the file and what is wrong with it."""
+    """The eval.json of a finished run. Raises ValueError that names the file and what is wrong with it."""
     try:
         metrics = json.loads(path.read_text())
     except ValueError as error:

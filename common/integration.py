@@ -1,4 +1,4 @@
-"""The integrator of all environments and of the nonlinear programs that are solved for them, and its events."""
+"""The integrator of all environments and of their nonlinear programs, and the roots of events."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import numpy as np
 
 
 def rk4(f, x, u, dt):
-    """One classical Runge-Kutta step of x' = f(x, u) with the control held, x a tuple of components.
+    """One classical Runge-Kutta step of x' = f(x, u) over dt with a held control. x is a tuple of components.
 
-    The paper's x_{k+1}, "performed using numerical methods such as Runge-Kutta schemes". Exact for the double
-    integrator: its solution is quadratic in dt. The components are NumPy arrays, CasADi symbols or torch tensors.
+    It is the paper's x_{k+1}, "performed using numerical methods such as Runge-Kutta schemes". It is exact for the
+    double integrator, whose solution is quadratic in dt. Components are NumPy arrays, CasADi symbols or torch tensors.
     """
     k1 = f(x, u)
     k2 = f(tuple(xi + 0.5 * dt * ki for xi, ki in zip(x, k1)), u)
@@ -19,29 +19,31 @@ def rk4(f, x, u, dt):
 
 
 def exp(x):
-    """e^x of an array, a symbol or a torch tensor, whose derivative NumPy's function would lose."""
+    """e^x of an array, a symbol or a torch tensor. NumPy's function would lose a tensor's derivative."""
     return x.exp() if hasattr(x, "exp") else np.exp(x)
 
 
-ROOT_TOLERANCE = 1e-12  # of the value at the begin
+ROOT_TOLERANCE = 1e-12  # relative to the value at the begin
 
 
 def falling_root(value, begin, end, until, evaluations=14):
-    """The times (n,) in (0, until] at which value(h (n,)) falls through 0: there it is 0, to 1e-12 of `begin`.
+    """The times (n,) in (0, until] at which value(h (n,)) falls through 0, where it is 0 to 1e-12 of `begin`.
 
-    begin > 0 >= end: its values at 0 and `until` (n,). A value that is above 0 by rounding alone counts as 0: secants
-    from above may come near the root without ever passing it. Regula falsi with the Pegasus change (Dowell and Jarratt,
-    1972): where one end of the bracket is replaced twice in a row, the value at the other is made smaller. The number
-    of evaluations is the same for all, so that a row does not depend on the rest of the batch.
+    begin > 0 >= end are the values at 0 and at `until` (n,). A value that is above 0 only by rounding counts as 0,
+    because secants from above may come near the root without ever passing it. The method is regula falsi with the
+    Pegasus change (Dowell and Jarratt, 1972): if one end of the bracket is replaced twice in a row, the value at the
+    other end is made smaller. All rows take the same number of evaluations, so no row depends on the rest of the batch.
     """
-    low, high = np.zeros_like(begin), until.copy()
-    f_low, f_high = begin.copy(), np.minimum(end, -1e-300)
+    low = np.zeros_like(begin)
+    high = until.copy()
+    f_low = begin.copy()
+    f_high = np.minimum(end, -1e-300)
     last = np.zeros(len(begin))  # 1: the last round replaced `high`, -1: `low`
     for _ in range(evaluations):
         h = np.clip(high - f_high * (high - low) / (f_high - f_low), low, high)
         f = value(h)
         below = f <= ROOT_TOLERANCE * begin
-        with np.errstate(divide="ignore", invalid="ignore"):  # where it is not used
+        with np.errstate(divide="ignore", invalid="ignore"):  # a bad number here is not used below
             lighter_low = f_low * f_high / (f_high + f)
             lighter_high = f_high * f_low / (f_low + f)
         f_low = np.where(below & (last == 1), lighter_low, f_low)

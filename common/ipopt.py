@@ -1,4 +1,4 @@
-"""IPOPT in CasADi: Ctrl-C while it runs, a limit in seconds, and a line where it takes long."""
+"""IPOPT in CasADi: Ctrl-C while it runs, a limit in seconds, and a printed line if it takes long."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import threading
 import time
 from contextlib import contextmanager
 
-PATIENCE = 5.0  # s without a line
-LEAST = 0.1  # s: less is none; IPOPT refuses a limit of 0
-limit = {"seconds": 120.0}  # of a rocket's solve, all its tries; `python baselines.py ID --solve-seconds` sets it
+PATIENCE = 5.0  # s until the line is printed
+LEAST = 0.1  # s; less time counts as none, because IPOPT refuses a limit of 0
+limit = {"seconds": 120.0}  # for all tries of a solve; `python baselines.py ID --solve-seconds` sets it
 
 
 class SolveClock:
-    """The seconds that the tries of one solve have taken together; after `PATIENCE` one line says that it goes on."""
+    """The seconds that all tries of one solve take. After `PATIENCE` one line says that the solve goes on."""
 
     def __init__(self, what: str):
         self.what = what
@@ -25,12 +25,12 @@ class SolveClock:
         return time.monotonic() - self.began
 
     def seconds_left(self) -> float:
-        """Until the limit; 0 beyond it."""
+        """The seconds until the limit, 0 after it."""
         left = limit["seconds"] - self.seconds()
         return left if left > LEAST else 0.0
 
     def speak(self):
-        """The line, once, on stderr."""
+        """Print the line, once, on stderr."""
         if not self.has_spoken and self.seconds() > PATIENCE:
             self.has_spoken = True
             print(
@@ -40,7 +40,7 @@ class SolveClock:
             )
 
     def callback(self, program: dict):
-        """For `nlpsol`: called after each of IPOPT's iterations."""
+        """The callback for `nlpsol`, which CasADi calls after each iteration of IPOPT."""
         import casadi as ca
 
         clock = self
@@ -72,19 +72,19 @@ class SolveClock:
                 clock.speak()
                 return [0]
 
-        self.kept = AfterIteration()  # CasADi holds no reference of its own
+        self.kept = AfterIteration()  # CasADi does not keep it alive
         return self.kept
 
 
 @contextmanager
 def interruptible():
-    """Raise at the block's end what a handler of SIGINT or SIGTERM raised within it, even where CasADi swallowed it.
+    """Raise at the block's end what a handler of SIGINT or SIGTERM raised in the block, even if CasADi swallowed it.
 
-    That is KeyboardInterrupt by default. CasADi takes it for one more failure of IPOPT, returns nothing, raises a
-    RuntimeError, or, where it tries an argument's types, passes over it.
+    By default that is KeyboardInterrupt. CasADi may take it for a failure of IPOPT, return nothing, raise a
+    RuntimeError, or ignore it while it tries the types of an argument.
     """
     raised: list[BaseException] = []
-    within = True  # a signal that comes while the handlers are put back waits for that
+    within = True  # False while the handlers are put back, which a signal must not interrupt
 
     def noted(handler):
         def note(signum, frame):
@@ -98,7 +98,7 @@ def interruptible():
         return note
 
     handlers = {}
-    if threading.current_thread() is threading.main_thread():  # the only one that signals reach
+    if threading.current_thread() is threading.main_thread():  # signals reach no other thread
         handlers = {signum: signal.getsignal(signum) for signum in (signal.SIGINT, signal.SIGTERM)}
         handlers = {signum: handler for signum, handler in handlers.items() if callable(handler)}
     try:

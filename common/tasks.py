@@ -1,10 +1,12 @@
-"""What the project asks of an environment id: one `Task` object for each, the same few methods for every family.
+"""What the project asks of an environment id: a `Task` for each id, with the same methods in every family.
 
-A *family* is a kind of environment: the small problems (`phased/`) and the rockets (`rocket/`), which have tables, and
-every other environment that is derived from `BatchedEnv` (`batched/`). `evaluate.py`, `runs.py`, the command of
-`baselines.py` and the benchmarks call `task_of(env_id)` and never ask which family it is. A new family is a folder with
-a class of this shape, and one line `add_family(TABLES, make_task)` in `envs.py`. The small problems' line is in
-`baselines.py`, which solves them: their ids are known once that is imported, as `evaluate.py` does.
+A *family* is a kind of environment. The small problems (`phased/`), the rockets (`rocket/`) and the landers
+(`landing/`) have tables. `batched/` is for all other environments derived from `BatchedEnv`. `evaluate.py`, `runs.py`,
+the command of `baselines.py` and the benchmarks call `task_of(env_id)`. They never ask which family an id is of.
+
+A new family is a folder with a class of this shape, and one line `add_family(TABLES, make_task)` in `envs.py`. The
+small problems' line is in `baselines.py`, which solves them. So their ids are known after `import baselines`, which
+`evaluate.py` does.
 """
 
 from __future__ import annotations
@@ -17,19 +19,19 @@ from common.errors import BadInput
 
 
 class Interface(NamedTuple):
-    """What a policy is given and what it answers, for those who call it elsewhere."""
+    """The numbers that a policy takes and gives, for users who call it elsewhere."""
 
     observation: Sequence[tuple[str, str]]  # name and unit of each number, in order
-    action: Sequence[tuple[str, str]]
-    notes: str  # frames, what was hidden, and how an action is used
+    action: Sequence[tuple[str, str]]  # the same for the action
+    notes: str  # frames, hidden observations, and the use of an action
 
 
 class Task(Protocol):
     """One environment id: its table, its optimum, how a policy on it is measured, printed and drawn.
 
-    `policy(obs (n, obs), t) -> action (n, actions)` is any function in NumPy, called at the steps t = 0, 1, ... of n
-    flights. `env_options` are keywords of the environment. `metrics` are what eval.json holds, a flat dictionary;
-    `arrays` what eval.npz holds. A task is made anew for each call of `task_of`: what is expensive is kept elsewhere.
+    `policy(obs (n, obs), t) -> action (n, actions)` is any NumPy function. It is called at the steps t = 0, 1, ... of n
+    flights. `env_options` are keyword arguments of the environment. `metrics` is the flat dictionary of eval.json,
+    `arrays` is that of eval.npz. Each call of `task_of` makes a new task, so expensive things are kept elsewhere.
     """
 
     @property
@@ -44,56 +46,56 @@ class Task(Protocol):
     def optimum(self, eval_seed: int, n: int, **env_options) -> dict:
         """The optimum of the n evaluated flights of a seed, as the environment flies it.
 
-        What was asked for lately is remembered. Raises NoOptimum where a solve fails.
+        Recent answers are remembered. Raises NoOptimum if a solve fails.
         """
         ...
 
     def evaluate(
         self, policy: Callable, eval_seed: int, n: int, reference: dict | None = None, **env_options
     ) -> tuple[dict, dict]:
-        """Fly the policy beside the optimum: (metrics, arrays). `reference` is that of `optimum`, if it is known.
+        """Fly the policy beside the optimum: (metrics, arrays). `reference` is the answer of `optimum`, if it is known.
 
-        The metrics are those that do not depend on the run; each is a finite number, a truth value or a string.
+        The metrics do not depend on the run. Each is a finite number, a truth value or a string.
         """
         ...
 
     def reported_metrics(self, metrics: dict, timed_policy: Callable | None = None, **env_options) -> dict:
-        """More metrics, too slow for the evaluations during a training: only the reported evaluation has them.
+        """More metrics for the reported evaluation. They are too slow for the evaluations during a training.
 
-        With `timed_policy` also the time of a decision, where this task reports it.
+        With `timed_policy` they include the time of a decision, if this task reports it.
         """
         ...
 
     # --- the size of an evaluation, and what a run may not do
 
     def default_flights(self, is_brief: bool, **env_options) -> int:
-        """How many flights the reported evaluation has where --eval-starts is not given; fewer if `is_brief`."""
+        """The number of flights in the reported evaluation if --eval-starts is not given. Fewer if `is_brief`."""
         ...
 
     def interim_flights(self, n: int, **env_options) -> int:
-        """How many flights an evaluation during a training has whose reported evaluation has n."""
+        """The number of flights in an evaluation during a training, if the reported evaluation has n."""
         ...
 
     def remark_on_seed(self, eval_seed: int) -> str | None:
-        """What to print where the evaluation's seed is that of the training."""
+        """The line to print if the evaluation's seed is that of the training."""
         ...
 
     def choices(self) -> dict[str, tuple[str, ...]]:
-        """The words that flags of this task may take: name -> words."""
+        """{name: words} of the task's flags that take one of some words."""
         ...
 
     def refusal(self, trains: bool, **env_options) -> tuple[str, str] | None:
-        """A flag (`no_observe_phase`) that does not fit these options, and why; None where all fit."""
+        """A flag, such as `no_observe_phase`, that does not fit these options, and why. None if all fit."""
         ...
 
     # --- words and pictures
 
     def table(self, metrics: dict) -> str:
-        """The printed table: optimum beside policy. Raises KeyError where a number is missing."""
+        """The printed table, with the optimum beside the policy. Raises KeyError if a number is missing."""
         ...
 
     def seed_rows(self) -> dict[str, tuple[str, str]]:
-        """The rows of a results folder's table of seeds: key of eval.json -> (label, number format)."""
+        """The rows of a results folder's table of seeds: {key of eval.json: (label, number format)}."""
         ...
 
     def progress_keys(self, **env_options) -> list[str]:
@@ -101,56 +103,56 @@ class Task(Protocol):
         ...
 
     def figures(self, arrays: dict, metrics: dict, curves: list[dict]) -> dict[str, Any]:
-        """The figures of an evaluation: file name -> Matplotlib figure.
+        """The figures of an evaluation: {file name: Matplotlib figure}.
 
-        curves: {TensorBoard tag: (steps, values)}, that of this run first, then those of other seeds; none, no
-        training.png.
+        curves are {TensorBoard tag: (steps, values)}, this run's first, then those of other seeds. Without curves there
+        is no training.png.
         """
         ...
 
     def animation(self, arrays: dict, metrics: dict) -> Any:
-        """The picture that moves: a `drawing.animation.Animation`."""
+        """The animation of an evaluation, a `drawing.animation.Animation`."""
         ...
 
     # --- files
 
     def required_arrays(self, metrics: dict) -> set[str]:
-        """The names of the arrays that the eval.npz of these metrics has to hold."""
+        """The names of the arrays that an eval.npz with these metrics must have."""
         ...
 
     def kept_arrays(self, arrays: dict) -> dict:
         """The arrays that a results folder keeps."""
         ...
 
-    # --- what is taken along (`python evaluate.py export`, `page`)
+    # --- for other tools (`python evaluate.py export`, `page`)
 
     def interface(self, **env_options) -> Interface:
         """Names and units of what a policy observes and commands."""
         ...
 
     def step_columns(self, arrays: dict, launch_longitude: float) -> dict[str, Any]:
-        """The flights of eval.npz, a row each step: NumPy columns by name. The longitude is a rocket's."""
+        """The flights of eval.npz with a row for each step: {name: NumPy column}. Only rockets use the longitude."""
         ...
 
     def flight_columns(self, arrays: dict, metrics: dict) -> dict[str, Any]:
-        """The flights of eval.npz, a row each: NumPy columns by name. BadInput where there is but one."""
+        """The flights of eval.npz with a row for each: {name: NumPy column}. Raises BadInput if there is only one."""
         ...
 
     def track(self, arrays: dict) -> Any:
-        """The flight around the Earth, a `formats.track.Track`; BadInput where it is none."""
+        """The flight around the Earth, a `formats.track.Track`. Raises BadInput for other flights."""
         ...
 
     def page(self, metrics: dict, arrays: dict, checkpoint: dict, launch_longitude: float) -> Any:
-        """The flight in the browser, a `pages.assemble.Page`; BadInput where there is none.
+        """The flight in the browser, a `pages.assemble.Page`. Raises BadInput if this task has no page.
 
-        `checkpoint` is what `read_checkpoint` returns. The longitude is a rocket's.
+        `checkpoint` is the answer of `read_checkpoint`. Only rockets use the longitude.
         """
         ...
 
     # --- commands
 
     def speed_cases(self) -> list[tuple[str, dict, list | None]]:
-        """What `benchmarks/env_speed.py` times: a label, options, and an action to hold (None: a random one)."""
+        """The cases of `benchmarks/env_speed.py`: label, options, and an action to hold (None: random actions)."""
         ...
 
     def add_arguments(self, parser) -> None:
@@ -158,16 +160,16 @@ class Task(Protocol):
         ...
 
     def baseline_command(self, args) -> tuple[dict, dict]:
-        """`python baselines.py ENV_ID`: solve and print; the numbers and arrays that --json and --npz ask for."""
+        """`python baselines.py ENV_ID`: solve and print. Returns the numbers for --json and the arrays for --npz."""
         ...
 
     def fly_opponents(self, folder: Path, **options) -> None:
-        """`python evaluate.py opponents FOLDER`: other guidance on the same flights; BadInput where there is none."""
+        """`python evaluate.py opponents FOLDER`: other guidance on the same flights. Raises BadInput without any."""
         ...
 
 
 class GroundTask:
-    """What is refused of an id whose flights do not go around the Earth."""
+    """The base of tasks whose flights do not go around the Earth: it refuses `track` and `page`."""
 
     env_id: str
 
@@ -179,7 +181,7 @@ class GroundTask:
 
 
 class SampledTask(GroundTask):
-    """What tasks have in common whose flights are sampled anew by every seed, and all cost the same."""
+    """The base of tasks in which every seed samples new flights, and all flights take the same time to evaluate."""
 
     def reported_metrics(self, metrics: dict, timed_policy: Callable | None = None, **env_options) -> dict:
         return {}
@@ -197,18 +199,18 @@ class SampledTask(GroundTask):
         return f"--eval-seed {eval_seed} is the training's --seed: it may have flown these starts"
 
 
-# of each family its tables by environment id, and how to make a task of an id
+# (tables by environment id, function that makes an id's task) of each family
 FAMILIES: list[tuple[Mapping[str, Any], Callable[[str], Task]]] = []
 
 
 def add_family(tables: Mapping[str, Any], make_task: Callable[[str], Task]) -> None:
-    """Make a family's ids known, or known anew. `tables` is kept: an id that is added to it later is known, too."""
+    """Make a family's ids known, also those that are added to `tables` later. The same `tables` replace themselves."""
     FAMILIES[:] = [family for family in FAMILIES if family[0] is not tables]
     FAMILIES.append((tables, make_task))
 
 
 class ForEachId(Mapping):
-    """A mapping by environment id whose values are made when they are asked for."""
+    """A mapping by environment id that makes a value when it is asked for."""
 
     def __init__(self, env_ids, make: Callable[[str], Any]):
         self.env_ids, self.make = tuple(env_ids), make
@@ -231,7 +233,7 @@ def env_ids() -> list[str]:
 
 
 def task_of(env_id: str) -> Task:
-    """The task of an environment id. Raises BadInput where no family has it."""
+    """The task of an environment id. Raises BadInput if no family has the id."""
     for tables, make_task in FAMILIES:
         if env_id in tables:
             return make_task(env_id)

@@ -1,4 +1,4 @@
-"""Processes that solve: jobs are shared out to them, which changes only the time."""
+"""Processes that share the jobs of a solve, which changes only the time."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from common.ipopt import limit
 
 
 class Workers:
-    """`number` processes that do jobs until `close`, or the end of a `with`. Where it is 1, this process does them.
+    """`number` processes that do jobs until `close` or the end of a `with`. With 1, this process does the jobs.
 
-    They are spawned, which is safe beside the threads of other libraries. They start with the first jobs, and have this
-    process's limit of a solve.
+    The processes are spawned, which is safe beside the threads of other libraries. They start with the first jobs, and
+    have this process's time limit of a solve.
     """
 
     def __init__(self, number: int):
@@ -33,7 +33,7 @@ class Workers:
             self.pool.shutdown()
 
     def map(self, function: Callable, jobs: list) -> list:
-        """function(job) of each job, in their order."""
+        """[function(job) for each job], in the jobs' order."""
         if not self.pool:
             return [function(job) for job in jobs]
         chunk = -(-len(jobs) // (4 * self.number)) or 1
@@ -41,5 +41,5 @@ class Workers:
 
 
 def set_limit(seconds: float):
-    """Of this process. `limit.update` would not do: a process that is spawned is sent a copy of the dictionary."""
+    """Set this process's limit. `limit.update` would not do, because a spawned process would get a copy of `limit`."""
     limit["seconds"] = seconds

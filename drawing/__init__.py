@@ -1,1 +1,1 @@
-"""What the pictures of all families share: style, files, training curves, animations. Knows no problem."""
+"""The base of all families' pictures: style, files, training curves, animations. It knows no problem."""

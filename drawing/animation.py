@@ -1,7 +1,7 @@
-"""The picture that moves: the sheet that a flight is drawn on, and the GIF.
+"""Animations: the sheet that a flight is drawn on, and the GIF.
 
-A family has a `Sheet` of its own, whose `frame` is what `render_mode="rgb_array"` gives; an evaluation's `Animation` is
-a sheet with flights on it. Needs no torch, no ffmpeg: Pillow, on which Matplotlib stands, writes the GIF.
+Each family has its own `Sheet`. `render_mode="rgb_array"` gives its `frame`. An evaluation's `Animation` is a sheet
+with flights on it. Pillow, which Matplotlib needs anyway, writes the GIF, so neither torch nor ffmpeg is needed.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from PIL import Image
 from common.errors import BadInput
 from common.files import replacing
 
-WIDTH, HEIGHT, DPI = 800, 450, 100  # pixels of a frame, and of an inch: sizes of text and lines are in points
+WIDTH, HEIGHT, DPI = 800, 450, 100  # pixels of a frame, and pixels of an inch, because text and lines are in points
 SIDES = {"": "policy", "_reference": "optimum"}  # by the suffix of their arrays in eval.npz
-# a flight's head: ours a dot, the optimum's a ring around it
+# a flight's head: a dot for the policy, a ring around it for the optimum
 DOT, LOOKS = (
     {"linestyle": "", "marker": "o", "zorder": 6},
     ({"markersize": 4.5}, {"markersize": 7, "fillstyle": "none"}),
 )
-GROWTH = 1.25  # axes grow by this factor, so that a running environment's do not creep
+GROWTH = 1.25  # axes grow by this factor, so that those of a running environment do not creep
 
 
 class Flight(NamedTuple):
-    """What was flown: times t (K+1,) s, controls u (K, m) held from each time to the next, states y (K+1, n)."""
+    """A flight: times t (K+1,) in s, controls u (K, m) held from each time to the next, states y (K+1, n)."""
 
     t: np.ndarray
     u: np.ndarray
@@ -37,7 +37,7 @@ class Flight(NamedTuple):
 
     @classmethod
     def of(cls, t, u, y, name: str) -> Flight:
-        """The flight of these arrays; BadInput, with its name, if they are not of one flight or hold a NaN."""
+        """The flight of these arrays. Raises BadInput with its name if they are not of one flight or have a NaN."""
         flight = cls(t, u, y)
         if not (u.ndim == y.ndim == 2 and len(t) == len(y) == len(u) + 1 > 1):
             shapes = f"t {t.shape}, u {u.shape}, states {y.shape}"
@@ -50,14 +50,14 @@ class Flight(NamedTuple):
         """The part up to `time` (s), with the state between two steps on the chord."""
         if time >= self.t[-1]:
             return self
-        k = max(int(np.searchsorted(self.t, time, side="right")), 1)  # steps begun
+        k = max(int(np.searchsorted(self.t, time, side="right")), 1)  # number of steps that have begun
         part = (time - self.t[k - 1]) / (self.t[k] - self.t[k - 1])
         y = (1 - part) * self.y[k - 1] + part * self.y[k]
         return Flight(np.append(self.t[:k], time), self.u[:k], np.vstack([self.y[:k], y]))
 
 
 class Sheet:
-    """A figure of WIDTH x HEIGHT pixels that is drawn again and again; `moving` are the artists that change."""
+    """A figure of WIDTH x HEIGHT pixels that is drawn again and again. `moving` are the artists that change."""
 
     def __init__(self, title: str):
         self.figure = Figure(figsize=(WIDTH / DPI, HEIGHT / DPI), dpi=DPI)
@@ -77,20 +77,20 @@ class Sheet:
         return ax
 
     def fit(self, flights: list[Flight]):
-        """Axes that hold all these flights."""
+        """Set axes that hold all these flights."""
         raise NotImplementedError
 
     def show(self, *sides: list[Flight], ended: bool = False):
-        """Draw the flights of each side as far as they go: the policy's, then the optimum's; `pixels` is the frame.
+        """Draw the flights of each side as far as they go: the policy's, then the optimum's. `pixels` gives the frame.
 
-        `ended`: the policy's go no further.
+        `ended` says that the policy's flights have ended.
         """
         raise NotImplementedError
 
     def frame(self, t, u, y) -> np.ndarray:
-        """One flight as far as it has come: times t (K+1,), controls u (K, m), states y (K+1, n).
+        """The picture of one flight so far, uint8 (HEIGHT, WIDTH, 3).
 
-        uint8, (HEIGHT, WIDTH, 3).
+        The flight has times t (K+1,), controls u (K, m) and states y (K+1, n).
         """
         flight = Flight(t, u, y)
         self.fit([flight])
@@ -98,9 +98,9 @@ class Sheet:
         return self.pixels()
 
     def pixels(self) -> np.ndarray:
-        """The sheet as it is now: uint8, (HEIGHT, WIDTH, 3)."""
+        """The sheet as it is now, uint8 (HEIGHT, WIDTH, 3)."""
         limits = [(ax.get_xlim(), ax.get_ylim()) for ax in self.figure.axes]
-        if limits != self._limits:  # ticks and text cost most of a drawing: what stands still is drawn once
+        if limits != self._limits:  # ticks and text take most of a drawing's time, so still artists are drawn once
             for artist in self.moving:
                 artist.set_animated(True)
             self.canvas.draw()
@@ -122,7 +122,7 @@ def room(base: float, values: np.ndarray) -> float:
 # ---------------------------------------------------------------------------------------------------------------------
 
 FRAMES, FRAME_MS, HOLD_MS = 130, 80, 2000  # the last frame is held; a GIF counts in hundredths of a second
-COLOURS = 96  # of the palette that all frames share: none flickers, and what stands still costs nothing
+COLOURS = 96  # colours of the one palette of all frames, so that none flickers and still parts take no bytes
 
 
 class Animation(NamedTuple):
@@ -134,28 +134,28 @@ class Animation(NamedTuple):
 
     @classmethod
     def of(cls, sheet: Sheet, sides: list[list[Flight]], haste: float = 1.0) -> Animation:
-        """The flights from begin to end; time goes with the power `haste` of the share played."""
+        """The flights from begin to end. The time shown is the power `haste` of the share played."""
         flights = [flight for side in sides for flight in side]
         sheet.fit(flights)
         share = np.linspace(0, 1, FRAMES) ** haste
         return cls(sheet, sides, share * max(flight.t[-1] for flight in flights))
 
     def frame(self, k: int) -> np.ndarray:
-        """Frame k: uint8, (HEIGHT, WIDTH, 3)."""
+        """Frame k, uint8 (HEIGHT, WIDTH, 3)."""
         time = self.times[k]
         ended = time >= self.sides[0][0].t[-1]
         self.sheet.show(*([flight.until(time) for flight in flights] for flights in self.sides), ended=ended)
         return self.sheet.pixels()
 
     def write(self, path: Path):
-        """Write it as a GIF."""
+        """Write the animation as a GIF."""
         path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path) as file:
             write_gif(file, self.frame, len(self.times))
 
 
 def write_gif(file, frame, count: int):
-    """Write `count` frames, `frame(k)` each uint8 (H, W, 3), as a GIF that plays for ever."""
+    """Write `count` frames as a GIF that plays for ever. `frame(k)` gives a frame, uint8 (H, W, 3)."""
     samples = np.vstack([frame(0), frame(count // 2), frame(count - 1)])
     palette = Image.fromarray(samples).quantize(COLOURS, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
     first, *others = indexed(frame, count, palette)

@@ -20,7 +20,7 @@ BOUNDARY = {"color": "0.5", "linewidth": 0.8, "linestyle": ":"}
 
 
 def save_figures(folder, figures: dict[str, Figure]) -> list[Path]:
-    """Write figures by their file names, in 256 colours: a quarter of the size. Returns the paths."""
+    """Write figures by their file names, in 256 colours, which take a quarter of the size. Returns the paths."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     for name, figure in figures.items():

@@ -11,7 +11,7 @@ from drawing.style import OPTIMUM, POLICY
 
 
 class TimePlots(Sheet):
-    """Any number of flights; `mark(panels)` draws what stands still, `limits` are the axes of the last panels."""
+    """Any number of flights. `mark(panels)` draws the still parts, and `limits` are the axes of the last panels."""
 
     def __init__(self, title: str, labels: list[str], states: int, horizon: float, compared: bool = False, mark=None):
         super().__init__(title)
@@ -36,7 +36,7 @@ class TimePlots(Sheet):
         return ax.add_collection(LineCollection([], zorder=4, **look), autolim=False)
 
     def fit(self, flights: list[Flight]):
-        """Axes that hold all these flights; they grow and never shrink, so that a running flight's do not jump."""
+        """Set axes that hold all these flights. They never shrink, so that those of a running flight do not jump."""
         for k, ax in enumerate(self.panels):
             columns = [flight.y[:, k] if k < self.states else flight.u[:, k - self.states] for flight in flights]
             values = np.concatenate(columns)
@@ -45,7 +45,7 @@ class TimePlots(Sheet):
             ax.set(ylim=(low - margin, high + margin))
 
     def show(self, *sides: list[Flight], ended: bool = False):
-        """Draw the flights of each side (the policy's; then the optimum's) as far as they go; `pixels` is the frame."""
+        """Draw the flights of each side so far: the policy's, then the optimum's. `pixels` gives the frame."""
         for flights, lines in zip(sides, self.lines):
             for k, line in enumerate(lines):
                 if k < self.states:

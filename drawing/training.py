@@ -12,7 +12,7 @@ from drawing.style import OPTIMUM, POLICY, TARGET
 
 
 class Miss(NamedTuple):
-    """How far a policy is from what it should reach, as the evaluations during a training log it."""
+    """A policy's distance from its aim, as the evaluations during a training log it."""
 
     tag: str  # of TensorBoard
     label: str
@@ -22,7 +22,7 @@ class Miss(NamedTuple):
 
 
 def training_figure(curves: list[dict], title: str, reference_return: float, miss: Miss) -> Figure:
-    """Reward, policy loss, total loss and, where it was logged, the mean action's miss over the samples.
+    """Reward, policy loss, total loss and, if it was logged, the mean action's miss over the samples.
 
     curves: {tag: (steps, values)} of each seed; with several each is thin and their median thick. `reference_return` is
     the optimum's mean.

@@ -1,1 +1,1 @@
-"""What is taken along: a policy as an ONNX model, trajectories as CSV, CCSDS OEM and CZML."""
+"""Files for other tools: a policy as an ONNX model, trajectories as CSV, CCSDS OEM and CZML."""

@@ -1,7 +1,7 @@
-"""A flight as CZML, what Cesium plays: the vehicle, its path, and a label that names the burn.
+"""A flight as CZML, which Cesium plays: the vehicle, its path, and a label that names the burn.
 
-Altitude and latitude over our spherical Earth are taken for height and geodetic latitude over Cesium's ellipsoid, so
-that the flight begins on the ground.
+Altitude and latitude over our spherical Earth are written as height and geodetic latitude over Cesium's ellipsoid. So
+the flight begins on the ground.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ GREEN, WHITE = [57, 211, 83, 255], [255, 255, 255, 255]
 
 
 def czml_bytes(track: Track, epoch: datetime, launch_longitude: float) -> bytes:
-    """The file; epoch is the moment of lift-off (UTC), the longitude in degrees east."""
+    """The file. epoch is the moment of lift-off (UTC), launch_longitude is in degrees east."""
     ground = over_ground(track, launch_longitude)
     end = float(track.t[-1])
     interval = f"{stamp(epoch, 0.0)}/{stamp(epoch, end)}"
@@ -58,7 +58,7 @@ def czml_bytes(track: Track, epoch: datetime, launch_longitude: float) -> bytes:
 
 
 def labels(track: Track, epoch: datetime) -> list[dict]:
-    """What happens last, from each event to the next."""
+    """The label from each event to the next: what happened last."""
     begins = [t for t, _ in track.events]
     ends = [*begins[1:], float(track.t[-1])]
     return [

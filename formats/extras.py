@@ -1,4 +1,4 @@
-"""Packages that only an export needs."""
+"""The check for packages that only an export needs."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from common.errors import BadInput
 
 
 def need(feature: str, *packages: str):
-    """BadInput with one line that says what to install, where a package is missing."""
+    """Raise BadInput with one line that says what to install, if a package is missing."""
     missing = [package for package in packages if find_spec(package) is None]
     if missing:
         raise BadInput(f"{feature} needs {' and '.join(missing)}: pip install -r requirements-extras.txt")

@@ -1,8 +1,8 @@
-"""A flight as a CCSDS Orbit Ephemeris Message (502.0-B-2), by the `oem` package: GMAT, STK and Orekit read it.
+"""A flight as a CCSDS Orbit Ephemeris Message (502.0-B-2), by the `oem` package. GMAT, STK and Orekit read it.
 
-Frame TOD, the true equator and equinox of date: its z axis is the Earth's, as ours is. The true sidereal time of the
-epoch and the launch site's longitude turn our x axis into its own. UT1 is taken for UTC: less than 0.9 s, 0.4 km of the
-launch site.
+The frame is TOD, the true equator and equinox of date. Its z axis is the Earth's axis, as in our frame. The true
+sidereal time of the epoch and the launch site's longitude turn our x axis into that of TOD. We take UT1 as UTC. The
+difference is less than 0.9 s, which is 0.4 km at the launch site.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from formats.track import Track, turned
 
 
 def oem_bytes(track: Track, epoch: datetime, launch_longitude: float) -> bytes:
-    """The file, km and km/s; epoch is the moment of lift-off (UTC), the longitude in degrees east.
+    """The file, in km and km/s. epoch is the moment of lift-off (UTC), launch_longitude is in degrees east.
 
-    BadInput where the `oem` package is not installed.
+    Raises BadInput if the `oem` package is not installed.
     """
     need("--oem", "oem")
     from astropy.time import Time
@@ -53,7 +53,7 @@ def oem_bytes(track: Track, epoch: datetime, launch_longitude: float) -> bytes:
 
 
 def sidereal_time(epoch: datetime) -> float:
-    """Greenwich apparent sidereal time of an epoch (UTC), rad: from the true equinox to the prime meridian."""
+    """Greenwich apparent sidereal time of an epoch (UTC): the angle (rad) from true equinox to prime meridian."""
     import erfa
     from astropy.time import Time
 

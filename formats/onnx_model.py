@@ -2,8 +2,8 @@
 
     python -m formats.onnx_model ppo_gtrxl_rocket results/rocket_cutoff/agent.safetensors policy.onnx
 
-The script is loaded by its file's name: its `features`, its agent and its weights are what is written, and no formula
-is written down twice but the attention of one step, whose memory is handed in and out here.
+The script is loaded by its file's name. Its `features`, its agent and its weights are written to the model. Only one
+formula is written down again here: the attention of one step, with the memory as an input and an output.
 """
 
 from __future__ import annotations
@@ -34,19 +34,21 @@ from common.tasks import task_of
 class PolicyStep(nn.Module):
     """The mean action of one step.
 
-    Inputs: `observation` (flights, obs) float64, and `memory` (blocks, 2, flights, heads, L, dk) float32, the keys and
-    values of the L steps before, the oldest first; zeros before the first step, as evaluations begin. Outputs: `action`
-    (flights, actions) and `next_memory`, both float32. A policy without blocks, or with L = 0, has no memory.
+    - inputs: `observation` (flights, obs) float64, and `memory` (blocks, 2, flights, heads, L, dk) float32
+    - outputs: `action` (flights, actions) and `next_memory`, both float32
 
-    The features are computed in float64, the network in float32, as it was trained. Some features are small differences
-    of large numbers: in float32 their rounding would be another one in each runtime.
+    The memory has the keys and values of the last L steps, the oldest first. It is zero before the first step, as in
+    evaluations. A policy without blocks, or with L = 0, has no memory.
+
+    The features are computed in float64, and the network in float32, in which it was trained. Some features are small
+    differences of large numbers. In float32 each runtime would round them differently.
     """
 
     def __init__(self, agent, features):
         super().__init__()
         self.agent = agent
         self.features = features
-        self.in_float64 = copy.deepcopy(agent).double()  # its buffers are the constants of the features
+        self.in_float64 = copy.deepcopy(agent).double()  # the features read its buffers
         memory = agent.new_memory(1, noise=0.0)
         self.constants = [constants for _, *constants in agent.start_cache(memory, steps=0)]
 
@@ -65,7 +67,7 @@ class PolicyStep(nn.Module):
 def attend(attention, x, past, projections, R):
     """`RelativeAttention.step` of x (N, d) with the keys and values `past` (2, N, H, L, dk), or without any.
 
-    Returns MultiHead(x) (N, d), and the keys and values of the last L steps, this one's included.
+    Returns MultiHead(x) (N, d), and the keys and values of the last L steps with this one.
     """
     qkv = F.linear(x, projections)  # (N, 3 d)
     qkv = qkv.unflatten(-1, (3, attention.num_heads, 1, attention.dk)).transpose(0, 1)  # (3, N, H, 1, dk)
@@ -77,25 +79,25 @@ def attend(attention, x, past, projections, R):
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What torch's exporter or onnxruntime does not have
+# Operations that torch's exporter or onnxruntime lacks
 # ---------------------------------------------------------------------------------------------------------------------
 
 
 def translations():
-    """Operations of the features that torch's exporter does not know, or that onnxruntime has in float32 alone."""
+    """Operations of the features that torch's exporter does not know, or that onnxruntime has only in float32."""
     from onnxscript import opset18  # pyright: ignore[reportMissingImports] - optional
 
     op: Any = opset18
     FLOAT, DOUBLE, INT64 = 1, 11, 7  # of TensorProto.DataType
 
     def searchsorted(sorted_sequence, self, *, out_int32=False, right=False, side=None, sorter=None):
-        """The number of entries (of a short table) that are below."""
+        """The number of entries of a short table that are below each value."""
         values = op.Unsqueeze(self, [-1])
         is_below = op.LessOrEqual(sorted_sequence, values) if right else op.Less(sorted_sequence, values)
         return op.ReduceSum(op.Cast(is_below, to=INT64), [-1], keepdims=0)
 
     def atan2(self, other):
-        """In float32, and then one step of Newton's method in float64."""
+        """atan2 in float32, then one step of Newton's method in float64."""
         y, x = op.Cast(self, to=FLOAT), op.Cast(other, to=FLOAT)
         first = op.Atan(op.Div(y, x))
         half_turn = op.Where(op.Less(y, 0.0), -3.14159265, 3.14159265)
@@ -120,7 +122,10 @@ def translations():
 
 
 def load(script, checkpoint):
-    """The agent of an agent.safetensors, its arguments, and the environment that it flies. BadInput if it is damaged"""
+    """The agent of an agent.safetensors, its arguments, its environment's options and its environment.
+
+    Raises BadInput if the file is damaged.
+    """
     defaults = {field.name: getattr(script.Args, field.name) for field in fields(script.Args)}
     sizes = ("num_blocks", "embed_dim", "num_heads", "memory_length", "mlp_dim", "hidden_dim")
     kinds = {name: type(defaults[name]) for name in ("env_id", *sizes)}
@@ -175,9 +180,9 @@ def export(script, checkpoint) -> Any:
 
 
 def main(script_name, checkpoint, target):
-    """Write the model of `checkpoint` to `target`; one line on stderr and status 1 if that cannot be done."""
+    """Write the model of `checkpoint` to `target`. If that fails, end with one line on stderr and status 1."""
     warnings.simplefilter("ignore")
-    logging.disable(logging.WARNING)  # torch's exporter names every optional package that is missing
+    logging.disable(logging.WARNING)  # torch's exporter would name every missing optional package
     try:
         with contextlib.redirect_stdout(sys.stderr):
             program = export(importlib.import_module(script_name), checkpoint)

@@ -1,4 +1,4 @@
-"""A policy as an ONNX model: made by `formats.onnx_model` in a process of its own, for nothing here imports torch."""
+"""A policy as an ONNX model. `formats.onnx_model` makes it in its own process, because this module imports no torch."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from formats.extras import need
 
 
 def onnx_bytes(checkpoint: Path) -> bytes:
-    """The model of an agent.safetensors. BadInput where it is damaged or a package is missing."""
+    """The model of an agent.safetensors. Raises BadInput if the file is damaged or a package is missing."""
     need("--onnx", "onnx", "onnxscript")
     script = script_of(checkpoint)
     with tempfile.TemporaryDirectory() as folder:

@@ -15,17 +15,17 @@ BODY = np.array([(1.6, -0.3), (1.6, 0.3), (0.8, 0.6), (0.0, 0.9), (0.5, 0.5), (0
 FLAME = np.array([(0.0, 0.4), (-1.0, 0.0), (0.0, -0.4)])
 SIZE, LENGTH = 0.028, 0.2  # of the body and of a full flame, as shares of the height in view
 GROUND = "#f2ddcf"
-BELOW = 0.07  # share of the height in view that is below the ground: room for the pad's name
-LONGEST = 50.0  # s: what the time axis of a flight that has just begun shows
+BELOW = 0.07  # share of the height in view that is below the ground, with room for the pad's name
+LONGEST = 50.0  # s, the length of the time axis when a flight has just begun
 NONE = np.empty((0, 1, 7))  # flights
-DOWN = 1e-3  # m: a flight that is lower has touched down
+DOWN = 1e-3  # m; a lower flight has touched down
 
 
 class DescentSheet(Sheet):
     """Altitude over downrange and over crossrange, thrust over time, and readings.
 
-    The controls of a flight are thrust vectors (N): those commanded of a running environment, those that acted in an
-    animation. `strike` is when a failure strikes the policy's flight (s).
+    The controls of a flight are thrust vectors in N: the commands for a running environment, the thrust that acted for
+    an animation. `strike` is the time (s) when a failure strikes the policy's flight.
     """
 
     def __init__(self, lander: Lander, title: str, compared: bool = False, strike: float | None = None):
@@ -106,7 +106,7 @@ class DescentSheet(Sheet):
     def show(self, *sides: list[Flight], ended: bool = False):
         """Draw the one flight of each side as far as it goes; `pixels` is the frame.
 
-        Until touchdown, thrust and readings are those of the last whole second: faster ones could not be read.
+        Until touchdown, thrust and readings are those of the last whole second, because faster ones could not be read.
         """
         flights = [flight for (flight,) in sides]
         second = np.floor(max(flight.t[-1] for flight in flights) + 1e-9)
@@ -155,9 +155,9 @@ def reading_of(y: np.ndarray) -> str:
 
 
 def descent_animation(lander: Lander, arrays: dict, title: str) -> Animation:
-    """The first flight that a failure struck, or the first of all where none did, beside its optimum if that is known.
+    """The first flight that a failure struck, or else the first flight, beside its optimum if that is known.
 
-    Of flights whose states are in the arrays.
+    Only flights whose states are in the arrays are considered.
     """
     failed = np.flatnonzero(has_failed(arrays["effectiveness"][: len(arrays["y"])]))
     row = int(failed[0]) if len(failed) else 0

@@ -2,9 +2,10 @@
 
     python evaluate.py opponents runs/<run>
 
-`guidance.py` has the opponents; here they are flown, measured as a policy is, and printed, beside the rows that the
-published code's notebooks print. Policies are flown by their script in processes of its own: nothing imports a script,
-or torch.
+`guidance.py` has the opponents. Here they are flown, measured as a policy is, and printed beside the rows that the
+notebooks of the published code print. The policies' script flies the policies in its own processes, so this module
+imports neither a script nor torch.
+
 Reading order: policies, laws, table, command.
 """
 
@@ -31,8 +32,8 @@ from landing.optimum import references
 
 POLICY_SCRIPT = Path(__file__).parents[1] / "ppo_gtrxl_lander.py"
 FAILURE = ("failure_probability", "failure_size", "failure_time")
-SOLVING = {"replanned", "replanned_wary"}  # laws that fly the first draws alone
-TIMED_FLIGHTS = 100  # flights at once when a decision is timed
+SOLVING = {"replanned", "replanned_wary"}  # laws that fly only the first draws
+TIMED_FLIGHTS = 100  # flights in a batch when a decision is timed
 
 # rows that the published notebooks print (RL-Meta-Learning-ACTA, Experiments/Mars3DOF/Engine_failure, cells of
 # `test_policy_batch`): position error mean and max (m), speed mean, sigma and max (m/s), fuel (kg), number of flights
@@ -52,7 +53,10 @@ PUBLISHED_KEYS += ("fuel_mean_kg", "eval_starts")
 
 
 def fly_checkpoint(path, failure: dict, eval_seed: int, n: int) -> dict:
-    """What the policy's script finds on the first n draws of a seed. BadInput with the script's own line."""
+    """The metrics that the policy's script finds on the first n draws of a seed.
+
+    Raises BadInput with the script's own line if the script refuses the policy.
+    """
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "eval.json"
         flags = {"eval-starts": n, "eval-seed": eval_seed, "eval-json": file, "num-threads": 1}
@@ -69,7 +73,7 @@ def fly_checkpoint(path, failure: dict, eval_seed: int, n: int) -> dict:
 
 
 def fly_law(env_id: str, make_law: Callable, z: np.ndarray, fuel: np.ndarray, **options) -> dict:
-    """The metrics of a law on draws z (n, 13); `fuel` (k,) is the optimum's of the first k, NaN where it has none."""
+    """The metrics of a law on draws z (n, 13). `fuel` (k,) is the optimum's for the first k draws, NaN without one."""
     flown = fly_draws(env_id, make_law, z, **options)
     known = np.flatnonzero(np.isfinite(fuel[: len(z)]))
     ratio = float(flown["fuel_kg"][known].mean() / fuel[known].mean())
@@ -77,15 +81,17 @@ def fly_law(env_id: str, make_law: Callable, z: np.ndarray, fuel: np.ndarray, **
 
 
 def decision_us(env_id: str, make_law: Callable, z: np.ndarray, **options) -> float:
-    """Microseconds of a law's decision for one flight, of many at once."""
-    spent, calls = 0.0, 0
+    """The time in microseconds of a law's decision for one flight, in a batch of flights."""
+    spent = 0.0
+    calls = 0
     law = make_law(z)
 
     def timed(obs, t):
         nonlocal spent, calls
         began = time.perf_counter()
         action = law(obs, t)
-        spent, calls = spent + time.perf_counter() - began, calls + len(obs)
+        spent += time.perf_counter() - began
+        calls += len(obs)
         return action
 
     fly_lander(env_id, timed, z, **options)
@@ -93,7 +99,7 @@ def decision_us(env_id: str, make_law: Callable, z: np.ndarray, **options) -> fl
 
 
 def law_makers(lander: Lander, failure: dict) -> dict[str, Callable]:
-    """By the names of `LAWS`: make_law(z) gives the law for flights of draws z (n, 13)."""
+    """{name of `LAWS`: make_law}, where make_law(z) gives the law for the flights of draws z (n, 13)."""
     return {
         "drdv": lambda z: drdv(lander, flights(lander, z, *failure.values()).gravity.T),
         "drdv_estimated": lambda z: drdv_estimated(lander),
@@ -103,7 +109,7 @@ def law_makers(lander: Lander, failure: dict) -> dict[str, Callable]:
 
 
 def fly_laws(env_id: str, failure: dict, eval_seed: int, n: int, solved: int) -> dict:
-    """Every law's metrics, by name, then the optimum's."""
+    """{name: metrics} of every law, then of the optimum."""
     z = draws(eval_seed, n)
     optimum = references(env_id, z[:solved], **failure)
     rows = {}
@@ -116,15 +122,16 @@ def fly_laws(env_id: str, failure: dict, eval_seed: int, n: int, solved: int) ->
 
 
 def optimum_row(optimum: dict) -> dict:
-    """The optimum's own row."""
+    """The optimum's row."""
     fuel = optimum["fuel_kg"][optimum["solved"]]
     row = {"eval_starts": len(fuel), "fuel_mean_kg": float(fuel.mean()), "fuel_ratio": 1.0}
     return row | {"reference_starts": len(fuel), "knows": "mass, gravity and failure"}
 
 
 def published_rows(env_id: str, eval_seed: int, n: int) -> dict:
-    """The published law by the exact end and by the published one, without and with failures."""
-    lander, z = LANDERS[env_id], draws(eval_seed, n)
+    """{label: metrics} of the published law, with the exact and the published end, without and with failures."""
+    lander = LANDERS[env_id]
+    z = draws(eval_seed, n)
     rows = {}
     for probability in (0.0, lander.failure_probability):
         failure = {"failure_probability": probability, "failure_size": lander.failure_size, "failure_time": "start"}
@@ -153,7 +160,7 @@ COLUMNS = (  # heading, keys of a row, number format, width
 
 
 def table(report: dict) -> str:
-    """opponents.json as a table: a line a competitor, then the published rows."""
+    """opponents.json as a table: a line for each competitor, then the published rows."""
     width = max(len(name) for part in ("laws", "published_law", "published") for name in report[part])
     lines = [f"{report['env_id']}, the draws of eval seed {report['eval_seed']}, the same for all"]
     lines.append(" " * (width + 2) + "".join(f"  {heading:>{w}}" for heading, _, _, w in COLUMNS) + "  knows")
@@ -168,7 +175,7 @@ def table(report: dict) -> str:
 
 
 def cell(row: dict, heading: str, keys: tuple, digits: str, width: int) -> str:
-    """A row's numbers of one column; "-" where it has none."""
+    """A row's numbers in one column, or "-" without them."""
     if not all(key in row for key in keys):
         return "-"
     return ", ".join(f"{row[key]:{digits}}" for key in keys)
@@ -191,10 +198,10 @@ def compare(
     failure_time: str = "random",
     navigation_noise=None,
 ):
-    """Compare a results folder's policy, and those of `also` (name, path), with all laws; print, write opponents.json.
+    """Compare a results folder's policy, and those of `also` (name, path), with all laws. Print and write it.
 
     All meet the failures of the folder's eval.json. `dispersion`, `failure`, `failure_time` and `navigation_noise` are
-    a rocket's.
+    flags for rockets. Writes opponents.json. Raises BadInput if one of those flags is given, or for other bad input.
     """
     given = {"dispersion": (dispersion, 1.0), "failure": (failure, 0.0), "failure-time": (failure_time, "random")}
     given["navigation-noise"] = (navigation_noise, None)

@@ -1,6 +1,6 @@
-"""How a lander flies while its thrust is held: a closed form, for NumPy arrays and CasADi symbols alike.
+"""The flight of a lander while its thrust is held: a closed form for NumPy arrays and CasADi symbols.
 
-r' = v, v' = T / m + g, m' = -|T| / c with T and g constant: the mass falls linearly, and both integrals are elementary.
+r' = v, v' = T / m + g, m' = -|T| / c with constant T and g. The mass falls linearly, and both integrals are elementary.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ import numpy as np
 from common.integration import falling_root
 from landing.lander import Lander
 
-TINY = 1e-300  # where h is 0, so is q
+TINY = 1e-300  # keeps a division by q finite where h, and so q, is 0
 
 
 def burn(r, v, mass, direction, flow, g, h, exhaust, log1p=np.log1p):
-    """State (r, v, m) after h seconds of thrust; direction is a unit vector, flow the propellant in kg/s, above 0.
+    """The state (r, v, m) after h seconds of thrust. direction is a unit vector, flow the propellant in kg/s, above 0.
 
-    With q = (m - m') / m', m' = m - flow h the mass at the end, and c the exhaust velocity:
+    With the mass m' = m - flow h at the end, q = (m - m') / m', and c the exhaust velocity:
 
         v' = v + g h + c direction ln(1 + q)
         r' = r + v h + g h^2 / 2 + c direction h (1 - ln(1 + q) / q)
@@ -32,7 +32,7 @@ def burn(r, v, mass, direction, flow, g, h, exhaust, log1p=np.log1p):
 
 
 class Arc(NamedTuple):
-    """A step of n flights: what is held during it, and its beginning."""
+    """A step of n flights: the state at its begin, and the thrust and gravity that are held during it."""
 
     r: np.ndarray  # (3, n)
     v: np.ndarray  # (3, n)
@@ -42,11 +42,11 @@ class Arc(NamedTuple):
     g: np.ndarray  # (3, n)
 
     def of(self, chosen) -> Arc:
-        """That of some of the flights."""
+        """The arc of the chosen flights, a mask or indices."""
         return Arc(*(array[..., chosen] for array in self))
 
     def after(self, h, lander: Lander):
-        """(r, v, m) after h seconds, a number or (n,); from the dry mass on without thrust."""
+        """(r, v, m) after h seconds, a number or (n,). At the dry mass the thrust ends."""
         left = (self.mass - lander.dry_mass) / self.flow  # s of propellant
         if (left > h).all():
             return burn(*self, h, lander.exhaust)
@@ -57,12 +57,14 @@ class Arc(NamedTuple):
         return r, v + self.g * coasting, np.maximum(mass, lander.dry_mass)
 
     def touchdown(self, h: float, end, lander: Lander):
-        """Which flights touch the ground within h seconds, and when: a mask (n,) and times (n,). Begun on it, none.
+        """The flights that touch the ground within h seconds, and the times in s: a mask (n,) and times (n,).
 
-        `end` is (r, v, m) after h. A soft touchdown is a dip: held on, its thrust would lift the lander off again.
-        Thrust along z grows with the falling mass, so that the altitude has one lowest point at most.
+        `end` is (r, v, m) after h. A flight that begins on the ground does not touch it. A soft touchdown is a dip: its
+        thrust, held on, would lift the lander off again. The acceleration along z grows while the mass falls, so the
+        altitude has at most one lowest point.
         """
-        low, until = end[0][2].copy(), np.full(len(self.mass), h)
+        low = end[0][2].copy()
+        until = np.full(len(self.mass), h)
         dips = np.flatnonzero((low > 0) & (self.r[2] > 0) & (self.v[2] < 0) & (end[1][2] > 0))
         if len(dips):
             some = self.of(dips)

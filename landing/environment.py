@@ -1,4 +1,4 @@
-"""The landers' environment: N descents in closed form, exact touchdowns; and how an id is registered."""
+"""The landers' environment: N descents in closed form with exact touchdowns, and how an id is registered."""
 
 from __future__ import annotations
 
@@ -28,37 +28,40 @@ from landing.rewards import (
     terminal_reward,
 )
 
-PERIOD = 0.2  # s: a command is held for it, or for a multiple; a failure strikes at one of its multiples
-PUBLISHED_CHECKS = (0.05, 0.1, 0.15, 0.2)  # s, when the published code looks at the altitude
-PUBLISHED_GROWTH = 500.0  # m by which the range may grow past its least
+PERIOD = 0.2  # s; a command is held for one or more periods, and a failure strikes at the begin of a period
+PUBLISHED_CHECKS = (0.05, 0.1, 0.15, 0.2)  # s within a period, when the published code looks at the altitude
+PUBLISHED_GROWTH = 500.0  # m by which the range may exceed its least value
 
 
 class LanderVectorEnv(BatchedEnv):
     """N descents of a `Lander`.
 
-    Action: the thrust vector over `greatest_thrust`. Its norm is clipped to the engine's limits; a zero command gets
-    the least thrust straight up. It is held for `decision_s` seconds (0.2, or a multiple). A failure then multiplies
+    Action: the thrust vector over `greatest_thrust`. Its norm is clipped to the engine's limits. A zero command gives
+    the least thrust straight up. A command is held for `decision_s` seconds, 0.2 or a multiple. A failure multiplies
     each axis by its effectiveness, and the norm is clipped once more.
 
-    Observation: r (m), v (m/s), time (s), and the clipped command of the step before in units of the action (0 at
-    first). Mass, gravity and failure are hidden. `observe_draw` shows them: mass over its nominal value, gravity's
-    deviation over its nominal value (3), the effectiveness of each axis at this moment (3). `observe_velocity=False`,
-    `observe_phase=False` (the time) and `observe_command=False` show zeros.
+    Observation: r (m), v (m/s), time (s), and the last clipped command in units of the action (0 at first). Mass,
+    gravity and failure are hidden. `observe_draw` shows them: mass over its nominal value, gravity's deviation over its
+    nominal value (3), and the current effectiveness of each axis (3). `observe_velocity=False`, `observe_phase=False`
+    (the time) and `observe_command=False` show zeros instead.
 
-    A flight ends at the exact moment of touchdown, or after `longest_flight` seconds (the lander's). With
-    `published_end` it ends as in the published code, which looks at the altitude every 0.05 s, flies on for one step
-    after the longest time, and stops a flight whose range grows by 500 m past its least.
+    A flight ends at the exact moment of touchdown, or after `longest_flight` seconds (by default the lander's). With
+    `published_end` it ends as in the published code. That code looks at the altitude every 0.05 s, flies one step
+    beyond the longest time, and stops a flight whose range exceeds its least value by 500 m.
 
-    Reward: -`fuel_price` for 100 kg burnt in the step; at the end `terminal_reward`, and `slope_reward` or, in the air,
-    -`aloft_price`. The prices and scales are attributes that only training changes. So are `sink_rate` (m/s), the
-    vertical speed at touchdown that counts as none; `thrust_share`, the share of the greatest thrust that a command may
-    ask for; `start_spread`, a factor on the width of the starts along x and y; and `wind`, the amplitude of `sway`.
+    Reward: -`fuel_price` for 100 kg burnt in the step. The last step adds `terminal_reward`. It also adds
+    `slope_reward` on the ground, or -`aloft_price` in the air. Only training changes these prices and scales, and
+
+    - `sink_rate` (m/s): the vertical speed at touchdown that counts as none
+    - `thrust_share`: the share of the greatest thrust that a command may ask for
+    - `start_spread`: a factor on the width of the starts along x and y
+    - `wind` (m/s^2): the amplitude of `sway`
 
     `final_info`: `episodic_return` (with the prices and scales of `rewards.py`), `position_error` (m), `speed` (m/s),
-    `slope`, `down`, `landed`, `fuel_kg`, `final_time` (s), each (N,), `final_y` (N, 7) and `draw` (N, 13).
+    `slope`, `down`, `landed`, `fuel_kg` and `final_time` (s), (N,) each, `final_y` (N, 7) and `draw` (N, 13).
 
-    `reset(options={"draw": (N, 13)})` sets what is drawn, numbers from 0 to 1 (`lander.DRAW`); `{"x0": (N, 6)}` sets r
-    and v.
+    `reset(options={"draw": z})` sets the draws z (N, 13), numbers from 0 to 1 (`lander.DRAW`). `{"x0": x}` sets r and v
+    by x (N, 6). Raises BadInput for anything else.
     """
 
     metadata = {**BatchedEnv.metadata, **RENDERED}
@@ -85,8 +88,10 @@ class LanderVectorEnv(BatchedEnv):
         self.failure_size = lander.failure_size if failure_size is None else failure_size
         self.failure_time = failure_time
         check_failure(self.failure_probability, self.failure_size, failure_time)
-        self.observe_command, self.observe_draw = observe_command, observe_draw
-        self.observe_velocity, self.observe_phase = observe_velocity, observe_phase
+        self.observe_command = observe_command
+        self.observe_draw = observe_draw
+        self.observe_velocity = observe_velocity
+        self.observe_phase = observe_phase
         self.published_end = published_end
         self.longest_flight = lander.longest if longest_flight is None else longest_flight
         possible = is_finite(self.longest_flight) and 0 < self.longest_flight <= lander.longest
@@ -110,7 +115,7 @@ class LanderVectorEnv(BatchedEnv):
         self._ticks = np.zeros(num_envs, dtype=np.int64)  # periods flown
         self.time = np.zeros(num_envs)  # s
         self._above = self.r.copy()  # the last position that was more than `SLOPE_HEIGHT` up
-        self._nearest = np.full(num_envs, np.inf)  # m, the least range
+        self._nearest = np.full(num_envs, np.inf)  # m, the least range so far
 
     @property
     def dt(self) -> float:
@@ -119,7 +124,7 @@ class LanderVectorEnv(BatchedEnv):
 
     @property
     def decision_s(self) -> float:
-        """The same; it may be set before a `reset`."""
+        """Seconds between two decisions. It may be set before a `reset`."""
         return self.dt
 
     @decision_s.setter
@@ -151,24 +156,29 @@ class LanderVectorEnv(BatchedEnv):
         count = int(mask.sum())
         draw = self._draw_starts(lambda n: self.np_random.random((n, len(DRAW))), count)
         if "draw" in options:
-            draw = self._checked("draw", options["draw"], len(DRAW), "from 0 to 1", lambda z: (z >= 0) & (z <= 1))[mask]
+            in_unit = lambda z: (z >= 0) & (z <= 1)  # noqa: E731
+            draw = self._checked("draw", options["draw"], len(DRAW), "from 0 to 1", in_unit)[mask]
         new = self._drawn(draw)
         if "x0" in options:
             above_ground = lambda x: (x[:, 2:3] > 0) & (x == x)  # noqa: E731
             x0 = self._checked("x0", options["x0"], 6, "finite, and above the ground (z > 0)", above_ground)[mask]
             new = new._replace(r=x0[:, :3].T, v=x0[:, 3:].T)
-        for mine, theirs in zip(self.flights, new):
-            mine[..., mask] = theirs
+        for column, drawn in zip(self.flights, new):
+            column[..., mask] = drawn
         self.draw[mask] = draw
-        self.r[:, mask], self.v[:, mask], self.mass[mask] = new.r, new.v, new.mass
+        self.r[:, mask] = new.r
+        self.v[:, mask] = new.v
+        self.mass[mask] = new.mass
         self._above[:, mask] = new.r
         self._nearest[mask] = np.inf
         self.u[mask] = 0.0
-        self.time[mask] = self._ticks[mask] = 0
-        self.down[mask] = self._ended[mask] = False
+        self.time[mask] = 0
+        self._ticks[mask] = 0
+        self.down[mask] = False
+        self._ended[mask] = False
 
     def _checked(self, name, given, width, allowed, holds):
-        """An option of `reset` as an array (N, width); BadInput where it is none."""
+        """An option of `reset` as an array (N, width), of which `holds` is true. Raises BadInput for anything else."""
         try:
             rows = np.asarray(given, dtype=np.float64)
         except (TypeError, ValueError):
@@ -178,14 +188,15 @@ class LanderVectorEnv(BatchedEnv):
         return rows
 
     def effectiveness(self) -> np.ndarray:
-        """What the thrust along each axis is multiplied by in this period, (3, N)."""
+        """The factors (3, N) on the thrust along each axis in this period."""
         has_struck = self._ticks * PERIOD >= self.flights.strike
         return np.where(has_struck, self.flights.failed, 1.0)
 
     def sway(self) -> np.ndarray:
-        """The acceleration (3, N) of `wind`: a sine along x and one along y, with a period of 10 to 30 s.
+        """The acceleration (3, N) of `wind` in m/s^2: a sine along x and one along y, with a period of 10 to 30 s.
 
-        Period and phases are digits of the draw that nothing else depends on: flights of one draw have one wind.
+        Period and phases come from digits of the draw on which nothing else depends. So flights of one draw have the
+        same wind.
         """
         digits = self.draw * 1000 % 1
         turns = self.time / (10 + 20 * digits[:, 2])
@@ -221,7 +232,7 @@ class LanderVectorEnv(BatchedEnv):
         return rewards, self._ended.copy(), self._final_info
 
     def _fly(self, command):
-        """Fly one period, in those environments whose flight has not ended."""
+        """Fly one period in the environments whose flight has not ended."""
         lander = self.lander
         thrust = limited(command * self.effectiveness(), lander.least_thrust, lander.greatest_thrust)
         norm = np.sqrt((thrust * thrust).sum(axis=0))
@@ -231,7 +242,7 @@ class LanderVectorEnv(BatchedEnv):
         r, v, mass = arc.after(PERIOD, lander)
         if self.published_end:
             touches, when = published_touchdown(arc, lander)
-        elif (r[2] < np.maximum(v[2], 0.0) * PERIOD).any():  # below ground, or it may have been
+        elif (r[2] < np.maximum(v[2], 0.0) * PERIOD).any():  # a flight is below ground, or may have been in the period
             touches, when = arc.touchdown(PERIOD, (r, v), lander)
         else:
             touches = np.zeros(self.num_envs, dtype=bool)
@@ -254,7 +265,7 @@ class LanderVectorEnv(BatchedEnv):
         self._ended = self._ended | touches | self._is_over()
 
     def _is_over(self):
-        """The flights (N,) that end without a touchdown."""
+        """The flights (N,) that end without a touchdown, as a mask."""
         elapsed = self._ticks * PERIOD
         if not self.published_end:
             return elapsed >= self.longest_flight - 1e-9
@@ -264,15 +275,15 @@ class LanderVectorEnv(BatchedEnv):
         return grows | (elapsed > self.longest_flight + 1e-9)
 
     def position_error(self) -> np.ndarray:
-        """Distance to the pad, (N,) m."""
+        """The distance (N,) to the pad in m."""
         return np.sqrt((self.r * self.r).sum(axis=0))
 
     def speed(self) -> np.ndarray:
-        """(N,) m/s."""
+        """The speed (N,) in m/s."""
         return np.sqrt((self.v * self.v).sum(axis=0))
 
     def slope(self) -> np.ndarray:
-        """Fall over run from the last sampled position that was more than 2 m up, (N,); the published glide slope."""
+        """Fall over run (N,) from the last sampled position more than 2 m up. It is the published glide slope."""
         dx, dy, dz = self._above - self.r
         return dz / np.maximum(np.hypot(dx, dy), 1e-9)
 
@@ -298,16 +309,16 @@ class LanderVectorEnv(BatchedEnv):
         return self.time.copy(), self.u.copy(), state_of(self)
 
     def _make_sheet(self):
-        # Matplotlib takes a quarter of a second that only a picture should cost
+        # only a picture should wait the quarter of a second that Matplotlib takes to load
         from landing.animation import DescentSheet
 
         return DescentSheet(self.lander, "Descent")
 
 
 def limited(vectors, least: float, greatest: float):
-    """Vectors (3, n) whose norms are clipped to these limits; a zero vector points up.
+    """Vectors (3, n) with their norms clipped to these limits. A zero vector points up.
 
-    Each is divided by its largest component first, so that no square overflows.
+    Each vector is first divided by its largest component, so that no square overflows.
     """
     size = np.abs(vectors).max(axis=0)
     if size.all():
@@ -320,8 +331,9 @@ def limited(vectors, least: float, greatest: float):
 
 
 def published_touchdown(arc: Arc, lander: Lander):
-    """Which flights are below ground when the published code looks, and when that is: a mask (n,) and times (n,)."""
-    touches, when = np.zeros(len(arc.mass), dtype=bool), np.full(len(arc.mass), PERIOD)
+    """The flights below ground when the published code looks, and the times in s: a mask (n,) and times (n,)."""
+    touches = np.zeros(len(arc.mass), dtype=bool)
+    when = np.full(len(arc.mass), PERIOD)
     for h in PUBLISHED_CHECKS:
         is_below = arc.after(h, lander)[0][2] < 0
         when[is_below & ~touches] = h
@@ -330,7 +342,7 @@ def published_touchdown(arc: Arc, lander: Lander):
 
 
 class LanderEnv(SingleEnv):
-    """One `LanderVectorEnv`; its public attributes are the batch's."""
+    """One flight of `LanderVectorEnv`, with the batch's public attributes."""
 
     position_scale = of_batch("position_scale", "Scale (m) of the position error in the terminal reward.")
     speed_scale = of_batch("speed_scale", "Scale (m/s) of the speed in the terminal reward.")
@@ -344,24 +356,24 @@ class LanderEnv(SingleEnv):
 
 
 def make_lander_vector(env_id: str, num_envs: int = 1, **options) -> LanderVectorEnv:
-    """The batched environment of a lander in `LANDERS`; what `gymnasium.make_vec` calls."""
+    """The batched environment of a lander in `LANDERS`. `gymnasium.make_vec` calls it."""
     check_options(LanderVectorEnv, options)
     return LanderVectorEnv(LANDERS[env_id], num_envs, **options).sealed()
 
 
 def make_lander(env_id: str, **options) -> LanderEnv:
-    """The single environment of a lander in `LANDERS`; what `gymnasium.make` calls."""
+    """The single environment of a lander in `LANDERS`. `gymnasium.make` calls it."""
     refuse_autoreset(options)
     return LanderEnv(make_lander_vector(env_id, **options)).sealed()
 
 
-make_lander.metadata = RENDERED  # where gym.make looks before there is an environment
+make_lander.metadata = RENDERED  # gym.make looks here before there is an environment
 
 
 def register_lander(env_id: str, lander: Lander):
-    """Make a lander an environment id that references, evaluation, figures and `ppo_gtrxl_lander.py` take, too.
+    """Register a lander as an environment id, which `ppo_gtrxl_lander.py`, evaluations and references then take, too.
 
-    Raises BadInput where the id is taken or not one of Gymnasium's.
+    Raises BadInput if the id is taken or not in Gymnasium's form.
     """
     taken = env_id in gym.registry or not ENV_ID_RE.fullmatch(env_id) or "/" in env_id
     refuse_unless(not taken, "env_id", repr(env_id), "must be a new id such as MyLander-v0")
@@ -375,13 +387,13 @@ def register_lander(env_id: str, lander: Lander):
 
 
 def fly_lander(env_id: str, policy: Callable, draw: np.ndarray, decision_s: float = PERIOD, **options) -> dict:
-    """Fly `policy(obs (n, obs), t) -> action (n, 3)` on draws (n, 13), and record what happened by periods of 0.2 s.
+    """Fly `policy(obs (n, obs), t) -> action (n, 3)` on draws (n, 13), and record the flights by periods of 0.2 s.
 
-    t counts decisions, one every `decision_s`; a command is repeated until the next.
+    t counts decisions, one every `decision_s` seconds. A command is held until the next decision.
 
-    Returns u (n, T, 3) N, the command before the failure acts, effectiveness (n, T, 3), and y (n, T+1, 7), r, v and m
-    at the periods' ends, all NaN behind a flight's last period; start (n, 7), gravity (n, 3), and the arrays of
-    `final_info`.
+    Returns u (n, T, 3) in N, the commands before the failure acts, effectiveness (n, T, 3), and y (n, T+1, 7) with r, v
+    and m at the periods' ends. These are NaN after a flight's last period. Also returns start (n, 7), gravity (n, 3)
+    and the arrays of `final_info`.
     """
     hold = round(decision_s / PERIOD)
     batch: Any = gym.make_vec(env_id, num_envs=len(draw), **options)  # a LanderVectorEnv
@@ -389,7 +401,8 @@ def fly_lander(env_id: str, policy: Callable, draw: np.ndarray, decision_s: floa
     start = state_of(batch)
     gravity = batch.flights.gravity.T.copy()
     u, effectiveness, y = [], [], [start]
-    final_info, alive = {}, np.ones(len(draw), dtype=bool)
+    final_info = {}
+    alive = np.ones(len(draw), dtype=bool)
     for period in range(batch.episode_steps):
         if period % hold == 0:
             action = policy(obs, period // hold)
@@ -409,5 +422,5 @@ def fly_lander(env_id: str, policy: Callable, draw: np.ndarray, decision_s: floa
 
 
 def state_of(batch: LanderVectorEnv) -> np.ndarray:
-    """r, v and m of all flights, (N, 7)."""
+    """r (m), v (m/s) and m (kg) of all flights, (N, 7)."""
     return np.vstack([batch.r, batch.v, batch.mass]).T

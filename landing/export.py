@@ -1,4 +1,4 @@
-"""What is taken along of a lander's flights: names and units of a policy's numbers, columns of a table."""
+"""A lander's policy and flights for other tools: names and units of a policy's numbers, columns of tables."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def interface(
     observe_draw: bool = False,
     **options,
 ) -> Interface:
-    """What a policy on these options of the environment observes and commands."""
+    """What a policy observes and commands, with these options of the environment."""
     commands = ["thrust_x", "thrust_y", "thrust_z"]
     before = [f"{name}_before" for name in commands]
     units = [*["m"] * 3, *["m/s"] * 3, "s", *["1"] * 3]
@@ -42,7 +42,7 @@ def interface(
 
 
 def step_columns(arrays: dict) -> dict[str, np.ndarray]:
-    """The flights below one another, a row each period: state, command from there on, what a failure leaves of it."""
+    """The columns of all flights, a row for each period: state, command from there on, effectiveness of each axis."""
     y = arrays["y"]
     n, rows = y.shape[:2]
     times = np.minimum(float(arrays["decision_s"]) * np.arange(rows), arrays["final_t"][:n, None])
@@ -53,7 +53,7 @@ def step_columns(arrays: dict) -> dict[str, np.ndarray]:
 
 
 def flight_columns(arrays: dict) -> dict[str, np.ndarray]:
-    """A row for each flight: start, gravity, touchdown, propellant, and the optimum's where it was solved."""
+    """The columns with a row for each flight: start, gravity, touchdown, propellant, and the optimum's if solved."""
     final = arrays["final_y"]
     n = len(final)
     reference = np.full(n, np.nan)

@@ -22,30 +22,30 @@ THRUSTS = 3  # flights of which the thrust is shown, too
 HEALTHY, FAILED = POLICY["color"], "tab:purple"
 STRIKE = {"color": "k", "linewidth": 1.0, "linestyle": "--"}
 BOX = {**TARGET, "linestyle": "--"}
-SMALLEST = 1e-4  # m and m/s: a smaller error is shown as this
-WHOLE_CIRCLE = 0.2  # of `POSITION_LIMIT`: wider touchdowns are shown with the whole circle around them
+SMALLEST = 1e-4  # m and m/s; a smaller error is shown as this
+WHOLE_CIRCLE = 0.2  # share of `POSITION_LIMIT`; wider touchdowns are shown with the whole circle around them
 
 
 def has_failed(effectiveness: np.ndarray) -> np.ndarray:
-    """Whether a failure struck each flight while it flew, (n,)."""
+    """The flights (n,) that a failure struck while they flew, as a mask."""
     return (effectiveness < 1).any(axis=(1, 2))
 
 
 def groups_of(effectiveness: np.ndarray) -> list[tuple]:
-    """Of the healthy and of the failed flights, as far as there are some: label, colour, marker and mask (n,)."""
+    """(label, colour, marker, mask (n,)) of the healthy and of the failed flights. An empty group is left out."""
     failed = has_failed(effectiveness)
     groups = [("healthy", HEALTHY, "o", ~failed), ("with a failure", FAILED, "x", failed)]
     return [group for group in groups if group[-1].any()]
 
 
 def strike_time(effectiveness: np.ndarray, period: float) -> float | None:
-    """When a failure struck one flight, effectiveness (T, 3) by periods of that many seconds; None: it is healthy."""
+    """The time (s) when a failure struck a flight with this effectiveness (T, 3) by `period` (s). None if healthy."""
     acts = (effectiveness < 1).any(axis=1)
     return float(np.argmax(acts) * period) if acts.any() else None
 
 
 def flown_states(flights: np.ndarray, row: int) -> np.ndarray:
-    """The states (K+1, 7) up to the end of one flight of (n, T+1, 7): none where there is no such flight."""
+    """The states (K+1, 7) of one flight of (n, T+1, 7) up to its end. Without such a flight there are none."""
     y = flights[row : row + 1].reshape(-1, 7)
     return y[np.isfinite(y).all(axis=1)]
 
@@ -53,7 +53,7 @@ def flown_states(flights: np.ndarray, row: int) -> np.ndarray:
 def flown_thrust(y: np.ndarray, gravity: np.ndarray, period: float) -> np.ndarray:
     """The thrust (K, 3) in N that acted in each period of one flight y (K+1, 7): m (dv/dt - g).
 
-    A touchdown cuts the last period short by an unknown time: its thrust is given as that of the period before.
+    A touchdown cuts the last period short by an unknown time, so its thrust is given as that of the period before.
     """
     mass = (y[1:, 6:] + y[:-1, 6:]) / 2
     thrust = mass * (np.diff(y[:, 3:6], axis=0) / period - gravity)
@@ -69,7 +69,7 @@ def flown_thrust(y: np.ndarray, gravity: np.ndarray, period: float) -> np.ndarra
 def descent_figure(arrays: dict, title: str, lander: Lander | None = None) -> Figure:
     """Altitude over downrange and crossrange (m) of the first flights; thrust (kN) over time (s) of three of them.
 
-    The optimum is shown of those three alone. A `lander` adds the limits of its thrust.
+    Only these three are shown with their optima. A `lander` adds the limits of its thrust.
     """
     figure = Figure(figsize=(13, 9.5), layout="constrained")
     paths, thrusts = figure.subfigures(2, 1, height_ratios=[3, 2])
@@ -199,9 +199,9 @@ def counted(count: int, noun: str) -> str:
 
 
 def fit_plane(ax, points: np.ndarray) -> list[str]:
-    """Axes that hold 99 % of the touchdowns (k, 2), with the circle of `POSITION_LIMIT`: remarks on what they do not.
+    """Set axes that hold 99 % of the touchdowns (k, 2). Returns remarks on what is out of view.
 
-    The circle is in view where it does not make a dot of the touchdowns.
+    The circle of `POSITION_LIMIT` is in view, unless the touchdowns would then be a dot.
     """
     reach = np.abs(points).max(axis=1, initial=0.0)
     half = 1.15 * float(np.percentile(reach, 99)) if len(points) else POSITION_LIMIT
@@ -239,7 +239,7 @@ def draw_box(ax):
 def propellant_figure(arrays: dict, title: str) -> Figure:
     """Propellant (kg) of each flight over the optimum's on the same draw, with the ratio of their sums.
 
-    Of the draws whose optimum is known.
+    Only draws with a known optimum are shown.
     """
     figure = Figure(figsize=(7.5, 7.2), layout="constrained")
     ax = figure.subplots()

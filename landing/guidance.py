@@ -1,11 +1,13 @@
 """Classical guidance of the landers: a policy's opponents.
 
     drdv              D'Souza's energy-optimal law, as published: it knows the true gravity
-    drdv_estimated    the same with each axis's effectiveness and gravity estimated in flight
-    Replanned         the fuel optimum from here on, by IPOPT with the same estimate, every few seconds
+    drdv_estimated    the same law with each axis's effectiveness and gravity estimated in flight
+    Replanned         the fuel optimum of the rest of the flight, by IPOPT with the same estimate, every few seconds
 
-A law is `policy(obs (n, obs), t) -> action (n, 3)`, the command over the greatest thrust, with obs as `LanderVectorEnv`
-shows it and a decision every 0.2 s. The last two keep something of each flight; t = 0 begins anew.
+A law is a function policy(obs (n, obs), t) -> action (n, 3), the command over the greatest thrust. obs is that of
+`LanderVectorEnv`, with a decision every 0.2 s. The last two laws remember something of each flight, and t = 0 begins
+new flights.
+
 Reading order: DR/DV, the estimate, replanning. CasADi is imported only where it solves.
 """
 
@@ -38,18 +40,18 @@ SOONEST = 1e-3  # s; the law divides by the time to go
 
 
 def energy_optimal_acceleration(r, v, seconds) -> np.ndarray:
-    """The acceleration (n, 3) now, gravity's included, that takes r, v (n, 3) to 0 in `seconds` (n,).
+    """The acceleration (n, 3) now, with gravity, that takes r and v (n, 3) to 0 in `seconds` (n,).
 
-    On the way it is linear in time, which has the least integral of its square.
+    It is linear in time on the way. So the integral of its square is the least.
     """
     t = np.maximum(seconds, SOONEST)[:, None]
     return -6 * r / t**2 - 4 * v / t
 
 
 def drdv(lander: Lander, gravity: np.ndarray) -> Callable:
-    """D'Souza's law with the gravity (n, 3) of each flight, and the nominal mass, which it takes for constant.
+    """D'Souza's law with the gravity (n, 3) of each flight and the nominal mass, which it takes as constant.
 
-    As Gaudet, Linares and Furfaro fly it: the time to go is that of the nominal gravity, straight down.
+    Gaudet, Linares and Furfaro fly it with the time to go of the nominal gravity, straight down. So do we.
     """
 
     def policy(obs, t):
@@ -65,26 +67,28 @@ def drdv(lander: Lander, gravity: np.ndarray) -> Callable:
 # The estimate: each axis's effectiveness and gravity, by recursive least squares
 # ---------------------------------------------------------------------------------------------------------------------
 
-PRIOR_EFFECTIVENESS, PRIOR_GRAVITY = 0.5, 0.2  # uncertainty at first, of 1 and of the nominal m/s^2
-MODEL_ERROR = 0.003  # m/s^2, of an acceleration
-DRIFT = 1e-4  # by which an effectiveness may change in a step; gravity stays
-JUMP = 0.1  # m/s^2; where an acceleration is off by more, the effectiveness is as uncertain as at first
-LEAST_EFFECTIVENESS = 0.1  # commands are divided by it
+PRIOR_EFFECTIVENESS, PRIOR_GRAVITY = 0.5, 0.2  # uncertainty at first: of an effectiveness of 1, of gravity in m/s^2
+MODEL_ERROR = 0.003  # m/s^2, standard deviation of an acceleration
+DRIFT = 1e-4  # standard deviation by which an effectiveness may change in a step; gravity does not change
+JUMP = 0.1  # m/s^2; after a larger error of the acceleration, the effectiveness is as uncertain as at first
+LEAST_EFFECTIVENESS = 0.1  # lower bound, because commands are divided by the effectiveness
 
 
 class Estimate:
     """What n flights show of their engine and gravity.
 
-    Along each axis, acceleration = effectiveness command / mass + gravity.
-    The mass is the nominal one less the propellant that the estimated thrust has burnt. So the effectiveness also holds
-    what the mass is off by, which stays the same share.
-    Least squares that forget lose the gravity, too, and then split an acceleration wrongly: with a failure at a random
-    moment and 0.9 a period, 13 % of 1000 flights of DR/DV did not land softly. Here only the effectiveness may change.
+    Along each axis acceleration = effectiveness command / mass + gravity. The mass is the nominal one minus the
+    propellant that the estimated thrust has burnt. So the effectiveness also absorbs the relative error of the mass,
+    which stays the same.
+
+    Only the effectiveness may change here. Least squares that forget all old data also lose the gravity, and then split
+    an acceleration wrongly. With a forgetting factor of 0.9 a period and failures at random moments, 13 % of 1000
+    flights of DR/DV did not land softly.
     """
 
     def __init__(self, lander: Lander, n: int):
         self.lander = lander
-        self.fitted = np.ones((n, 3))  # effectiveness, before it is kept above `LEAST_EFFECTIVENESS`
+        self.fitted = np.ones((n, 3))  # effectiveness, before its lower bound `LEAST_EFFECTIVENESS`
         self.gravity = np.tile([0.0, 0.0, -lander.gravity], (n, 1))
         self.mass = np.full(n, lander.mass)
         self.covariance = np.tile([PRIOR_EFFECTIVENESS**2, 0.0, PRIOR_GRAVITY**2], (n, 3, 1))  # (n, 3, 3): ee, eg, gg
@@ -93,11 +97,11 @@ class Estimate:
 
     @property
     def effectiveness(self) -> np.ndarray:
-        """Of each axis, (n, 3)."""
+        """The effectiveness of each axis, (n, 3)."""
         return np.maximum(self.fitted, LEAST_EFFECTIVENESS)
 
     def command(self, acceleration) -> np.ndarray:
-        """The command (n, 3) in N that gives an acceleration (n, 3), gravity's included."""
+        """The command (n, 3) in N that gives an acceleration (n, 3), which includes gravity."""
         return self.mass[:, None] * (acceleration - self.gravity) / self.effectiveness
 
     def update(self, obs):
@@ -115,14 +119,15 @@ class Estimate:
         self.v, self.time = v.copy(), now.copy()
 
     def _fit(self, push, acceleration, has_flown):
-        """A step of least squares: acceleration = fitted push + gravity, each (n, 3), in the flights has_flown (n, 1).
+        """A step of least squares: acceleration = fitted push + gravity, (n, 3) each, in the flights has_flown (n, 1).
 
-        The textbook's formulas, with phi = (push, 1): K = P phi / (R + phi' P phi), P = P - K phi' P.
+        These are the textbook's formulas with phi = (push, 1): K = P phi / (R + phi' P phi), P = P - K phi' P.
         """
         ee, eg, gg = np.moveaxis(self.covariance, 2, 0)
         missing = acceleration - self.fitted * push - self.gravity
         ee = ee + np.where(np.abs(missing) > JUMP, PRIOR_EFFECTIVENESS, DRIFT) ** 2
-        e, g = ee * push + eg, eg * push + gg  # P phi
+        e = ee * push + eg  # P phi is (e, g)
+        g = eg * push + gg
         variance = MODEL_ERROR**2 + push * e + g
         covariance = np.stack([ee - e * e / variance, eg - e * g / variance, gg - g * g / variance], axis=2)
         self.fitted = np.where(has_flown, self.fitted + e / variance * missing, self.fitted)
@@ -131,7 +136,7 @@ class Estimate:
 
 
 def drdv_estimated(lander: Lander) -> Callable:
-    """DR/DV with the estimate of effectiveness, gravity and mass; nothing hidden is told to it."""
+    """DR/DV with the estimate of effectiveness, gravity and mass. It knows nothing that is hidden."""
     estimate = Estimate(lander, 0)
 
     def policy(obs, t):
@@ -151,13 +156,13 @@ def drdv_estimated(lander: Lander) -> Callable:
 # ---------------------------------------------------------------------------------------------------------------------
 
 REPLAN_EVERY = 5.0  # s
-LAST_REPLAN = 12.0  # s before the planned touchdown; later plans put off what they cannot reach any more
-CHANGE = 0.05  # of the estimated effectiveness, at which a flight is replanned at once
-HANDOVER = 3.0  # s before the planned touchdown, from when on the energy-optimal law flies
-OWN_TIME = 0.5  # s before it, from when on that law also chooses the time to go
+LAST_REPLAN = 12.0  # s before the planned touchdown; later plans postpone a touchdown that they cannot reach any more
+CHANGE = 0.05  # change of the estimated effectiveness that is replanned at once
+HANDOVER = 3.0  # s before the planned touchdown, when the energy-optimal law takes over
+OWN_TIME = 0.5  # s before the planned touchdown, when that law begins to choose the time to go
 RESERVE = 0.95  # share of the greatest thrust that plans use; the rest is for the feedback
-WARY_RESERVE = 0.55  # the same while the engine is whole, where a failure may come
-WHOLE = 0.85  # effectiveness of an engine that has not failed, at least
+WARY_RESERVE = 0.55  # the same share while the engine is whole, if a failure may come
+WHOLE = 0.85  # the least effectiveness of an engine that has not failed
 PLANNED_LEAST = 1.3  # times the least thrust: below it the engine would hide a failure, which it does not go below
 FEEDBACK_TIME = 5.0  # s in which what a flight is off its plan is taken back
 PLAN_INTERVALS = 25
@@ -169,12 +174,12 @@ class Job(NamedTuple):
 
     lander: Lander
     descent: Descent
-    limits: tuple[float, float]  # N, of the thrust
-    guess: Trajectory | None  # what is left of the last plan
+    limits: tuple[float, float]  # N, least and greatest thrust
+    guess: Trajectory | None  # the rest of the last plan
 
 
 def plan_one(job: Job) -> tuple[Trajectory | None, float]:
-    """The plan of one flight, None where IPOPT finds none, and its seconds on one core."""
+    """The plan of one flight, or None if IPOPT finds none, and the seconds that it took on one core."""
     begin = time.process_time()
     guesses = first_guesses(job) if job.guess is None else [job.guess]
     plan = None
@@ -189,26 +194,30 @@ def plan_one(job: Job) -> tuple[Trajectory | None, float]:
 
 
 def first_guesses(job: Job) -> list[Trajectory]:
-    """Where IPOPT begins without a last plan."""
+    """The guesses from which IPOPT begins without a last plan."""
     r, v = job.descent.state[None, :3], job.descent.state[None, 3:6]
     energy_optimal = float(energy_optimal_time(r, v, job.lander.gravity)[0])
     return [straight_line(job.lander, job.descent, share * energy_optimal, PLAN_INTERVALS) for share in DURATIONS]
 
 
 class Replanned:
-    """The fuel optimum from here on, solved again and again with the estimate, as a policy.
+    """The law that flies the fuel optimum of the rest of the flight, solved again and again with the estimate.
 
-    A flight is planned at its start, every `REPLAN_EVERY` seconds until `LAST_REPLAN`, and where the estimate of its
-    engine changes. A plan has `PLAN_INTERVALS` of held thrust. Between plans its acceleration is flown, with feedback:
-    what a flight is off in r and v is taken back by the energy-optimal law, which also flies the last seconds. Where
-    IPOPT fails, the last plan is kept; without one DR/DV flies.
+    A flight is planned at its start, every `REPLAN_EVERY` seconds until `LAST_REPLAN`, and when the estimate of its
+    engine changes. A plan has `PLAN_INTERVALS` of held thrust. Between plans the plan's acceleration is flown with
+    feedback: the energy-optimal law takes back the flight's errors in r and v. The same law flies the last seconds. If
+    IPOPT fails, the last plan is kept. Without any plan DR/DV flies.
 
-    With `is_wary` plans use so little thrust, until a failure is seen, that one can still be survived. The optimum of
-    a whole engine falls fast and brakes late: of 79 flights of 200 that a failure struck at a random moment 53 % did
-    not land softly. Of the wary ones 1 % did not; they burn 9 % more than the optimum that knows all, the others 1.4 %.
+    With `is_wary` plans use little thrust until a failure is seen, so that a failure can still be survived. The optimum
+    of a whole engine falls fast and brakes late. In 200 flights failures at random moments struck 79. This is what
+    became of the 79, and how much more the law burns than the optimum that knows all:
 
-    Solves are shared out to `processes`, which changes only the time. `failed` and `seconds` (one a solve) are counted
-    from its making on.
+                not soft   propellant
+        plain   53 %       +1.4 %
+        wary     1 %       +9 %
+
+    `processes` share the solves, which changes only the time. `failed` counts the solves without a plan. `seconds` has
+    one number for each solve.
     """
 
     def __init__(self, lander: Lander, is_wary: bool = False, processes: int = 1):
@@ -241,13 +250,14 @@ class Replanned:
         """Forget all flights; n others begin."""
         self.estimate = Estimate(self.lander, n)
         self.plans: list[Trajectory | None] = [None] * n
-        self.ends = np.tile(np.arange(-PLAN_INTERVALS - 1.0, 0.0), (n, 1))  # s, of the plans' intervals; of none, past
-        self.thrust = np.zeros((n, PLAN_INTERVALS, 3))  # N, in them
-        self.y = np.zeros((n, PLAN_INTERVALS + 1, 7))  # at their ends
-        self.planned_with = np.ones((n, 3))  # the effectiveness
+        # s, the ends of the plans' intervals; without a plan they lie in the past
+        self.ends = np.tile(np.arange(-PLAN_INTERVALS - 1.0, 0.0), (n, 1))
+        self.thrust = np.zeros((n, PLAN_INTERVALS, 3))  # N, in the intervals
+        self.y = np.zeros((n, PLAN_INTERVALS + 1, 7))  # at the intervals' ends
+        self.planned_with = np.ones((n, 3))  # the effectiveness that each plan was made with
 
     def _due(self, obs, t) -> np.ndarray:
-        """The flights that are to be planned now."""
+        """The indices of the flights that are to be planned now."""
         left = self.ends[:, -1] - obs[:, 6]
         has_changed = (np.abs(self.estimate.effectiveness - self.planned_with) > CHANGE).any(axis=1)
         is_time = t % round(REPLAN_EVERY / PERIOD) == 0
@@ -255,7 +265,7 @@ class Replanned:
         return np.flatnonzero(due & (obs[:, 2] > 0))
 
     def _replan(self, obs, flights):
-        """New plans for some flights."""
+        """Make new plans for these flights, indices of obs (n, obs)."""
         jobs = [self._job(obs[k], k) for k in flights]
         for k, (plan, seconds) in zip(flights, self.workers.map(plan_one, jobs)):
             self.seconds.append(seconds)
@@ -269,8 +279,9 @@ class Replanned:
             self.y[k] = plan.y
 
     def _job(self, obs, k: int) -> Job:
-        """The plan of flight k of obs (obs,), by the estimate and from what is left of the last plan."""
-        effectiveness, plan = self.estimate.effectiveness[k], self.plans[k]
+        """The job of planning flight k at obs (obs,), by the estimate, with the rest of the last plan as the guess."""
+        effectiveness = self.estimate.effectiveness[k]
+        plan = self.plans[k]
         state = np.append(obs[:6], self.estimate.mass[k])
         descent = Descent(state, self.estimate.gravity[k], effectiveness, strike=0.0)
         is_whole = effectiveness.min() > WHOLE
@@ -284,12 +295,14 @@ class Replanned:
         return Job(self.lander, descent, limits, rest)
 
     def _acceleration(self, r, v, now) -> np.ndarray:
-        """The plans' over the period from `now` (n,) s on, gravity's included, with feedback, (n, 3)."""
+        """The plans' acceleration (n, 3) over the period from `now` (n,) s on, with gravity and feedback."""
         flights = np.arange(len(now))
         ends = self.ends[:, 1:-1]
         interval = (ends <= now[:, None]).sum(axis=1)
-        begin, length = self.ends[flights, interval], np.diff(self.ends, axis=1)[flights, interval]
-        y, y_next = self.y[flights, interval], self.y[flights, interval + 1]
+        begin = self.ends[flights, interval]
+        length = np.diff(self.ends, axis=1)[flights, interval]
+        y = self.y[flights, interval]
+        y_next = self.y[flights, interval + 1]
         past = (now - begin)[:, None]
         mean = (y_next[:, 3:6] - y[:, 3:6]) / length[:, None]
         r_planned = y[:, :3] + y[:, 3:6] * past + mean * past**2 / 2

@@ -1,4 +1,4 @@
-"""Landers: the table of a vehicle and its descent, what is drawn for each flight, and what cannot fly.
+"""Landers: the table of a vehicle and its descent, what each flight draws, and which landers cannot fly.
 
 `MARS` is the problem of Gaudet, Linares and Furfaro, "Adaptive guidance and integrated navigation with reinforcement
 meta-learning" (Acta Astronautica, 2020), with the numbers of their public code. `POWERED_DESCENT` is the lander of
@@ -18,29 +18,29 @@ import numpy as np
 from common.errors import is_finite, refuse_unless, refuse_unless_finite
 
 FAILURE_TIMES = ("start", "random")
-LAST_FAILURE = 40.0  # s: "random" failures strike before
-VERTICAL_LOSS = 1.5  # a failure divides the thrust along z by this, whatever its size
+LAST_FAILURE = 40.0  # s, before which "random" failures strike
+VERTICAL_LOSS = 1.5  # a failure of any size divides the thrust along z by this
 
 
 @dataclass(frozen=True)
 class Lander:
-    """One column of numbers: vehicle, planet, and the box of its starts."""
+    """A vehicle, its planet and the box of its starts. Raises BadInput for a lander that cannot fly."""
 
-    mass: float  # kg, at first
-    dry_mass: float  # kg; at this mass the engine stops
+    mass: float  # kg, at the start
+    dry_mass: float  # kg, at which the engine stops
     isp: float  # s
     least_thrust: float  # N
     greatest_thrust: float  # N
     start: tuple[float, ...]  # centre of the box of r (m) and v (m/s), six numbers
-    spread: tuple[float, ...] = (0.0,) * 6  # half its widths
-    g0: float = 9.81  # m/s^2, with isp the exhaust velocity
-    cant: float = 0.0  # degrees between the nozzles and the thrust: of their flow, the cosine pushes
+    spread: tuple[float, ...] = (0.0,) * 6  # half widths of the box
+    g0: float = 9.81  # m/s^2; isp g0 is the exhaust velocity
+    cant: float = 0.0  # degrees between the nozzles and the thrust, whose cosine multiplies the exhaust velocity
     gravity: float = 3.7114  # m/s^2, downwards
-    mass_spread: float = 0.0  # greatest share by which a flight's mass is off
-    gravity_spread: float = 0.0  # the same of gravity, in each axis
-    failure_probability: float = 0.0  # of a hidden failure, unless the environment is given another
-    failure_size: float = 2.5  # what a failure divides the thrust along one lateral axis by
-    longest: float = 100.0  # s, of a flight
+    mass_spread: float = 0.0  # the largest relative error of a flight's mass
+    gravity_spread: float = 0.0  # the largest error of gravity in each axis, relative to `gravity`
+    failure_probability: float = 0.0  # probability of a hidden failure, unless the environment is given another
+    failure_size: float = 2.5  # a failure divides the thrust along one lateral axis by this
+    longest: float = 100.0  # s, the longest flight
 
     def __post_init__(self):
         refuse_unless_finite("a lander's", self)
@@ -66,13 +66,14 @@ class Lander:
 
     @property
     def exhaust(self) -> float:
-        """Thrust in N for each kg/s of propellant."""
+        """The exhaust velocity in m/s: thrust in N for each kg/s of propellant."""
         return self.isp * self.g0 * math.cos(math.radians(self.cant))
 
     @property
     def reach(self) -> tuple[float, float]:
-        """Bounds of |r| (m) and |v| (m/s): thrust and gravity pointing one way for the longest flight."""
-        r0, v0 = self.farthest(slice(0, 3)), self.farthest(slice(3, 6))
+        """Bounds of |r| (m) and |v| (m/s), as if thrust and gravity pointed one way for the longest flight."""
+        r0 = self.farthest(slice(0, 3))
+        v0 = self.farthest(slice(3, 6))
         gravity = self.gravity * (1 + 2 * self.gravity_spread)  # three components, each off by the spread
         gain = self.exhaust * math.log(self.mass * (1 + self.mass_spread) / self.dry_mass)
         v = v0 + gain + gravity * self.longest
@@ -80,7 +81,7 @@ class Lander:
 
     @property
     def has_one_flight(self) -> bool:
-        """Whether all flights are alike, as long as nothing fails."""
+        """Whether all flights are equal, as long as nothing fails."""
         return not any((*self.spread, self.mass_spread, self.gravity_spread, self.failure_probability))
 
     def farthest(self, of: slice) -> float:
@@ -89,7 +90,7 @@ class Lander:
 
 
 def check_failure(probability: float, size: float, time: str = "start"):
-    """BadInput for a failure that cannot be drawn."""
+    """Raise BadInput for a failure that cannot be drawn."""
     in_unit = is_finite(probability) and 0 <= probability <= 1
     refuse_unless(in_unit, "failure_probability", repr(probability), "must be from 0 to 1")
     refuse_unless(is_finite(size) and size >= 1, "failure_size", repr(size), "must be at least 1")
@@ -97,17 +98,17 @@ def check_failure(probability: float, size: float, time: str = "start"):
 
 
 class Flights(NamedTuple):
-    """What is drawn for n flights. Nothing of it but r and v is shown to a policy."""
+    """What n flights draw. A policy sees only r and v of it."""
 
     r: np.ndarray  # (3, n) m, at the start
     v: np.ndarray  # (3, n) m/s, at the start
     mass: np.ndarray  # (n,) kg, at the start
     gravity: np.ndarray  # (3, n) m/s^2
-    failed: np.ndarray  # (3, n) effectiveness of each axis once the failure has struck; 1 in a healthy flight
-    strike: np.ndarray  # (n,) s, when it strikes; infinite in a healthy flight
+    failed: np.ndarray  # (3, n) effectiveness of each axis after the failure; 1 in a healthy flight
+    strike: np.ndarray  # (n,) s, when the failure strikes; infinite in a healthy flight
 
 
-# a draw is a row of numbers from 0 to 1, all alike likely
+# a draw is a row of uniform numbers from 0 to 1
 DRAW = ("x", "y", "z", "vx", "vy", "vz", "mass", "gx", "gy", "gz", "failure", "axis", "moment")
 
 
@@ -116,10 +117,11 @@ def flights(
 ) -> Flights:
     """The flights of draws (n, 13). `start_spread` widens the box of the starts, but not its heights and sink rates.
 
-    A failure is there where the draw's "failure" is below `probability`. It divides the thrust along x ("axis" below
-    0.5) or y by `size`, and along z by 1.5.
+    A flight has a failure if the draw's "failure" is below `probability`. The failure divides the thrust along x, if
+    "axis" is below 0.5, or along y by `size`. It divides the thrust along z by 1.5.
     """
-    start, spread = np.array(lander.start), np.array(lander.spread)
+    start = np.array(lander.start)
+    spread = np.array(lander.spread)
     centred = 2 * draw - 1
     widths = np.array([start_spread, start_spread, 1.0] * 2)
     state = start + widths * spread * centred[:, :6]

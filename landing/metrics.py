@@ -1,7 +1,7 @@
-"""What landings are measured by. The names of all metrics (eval.json) and arrays (eval.npz) are the interface.
+"""The metrics of landings. The names of all metrics (eval.json) and arrays (eval.npz) are the project's interface.
 
-One flight says little: draws differ. A policy is measured on many, its fuel beside the optimum's on the first
-`REFERENCE_STARTS`.
+Draws differ, so one flight says little. A policy is measured on many draws. Its fuel is compared with the optimum's on
+the first `REFERENCE_STARTS` draws.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ from landing.rewards import POSITION_LIMIT, SPEED_LIMIT
 
 FLIGHTS = 10_000  # the published code's number
 REFERENCE_STARTS = 200
-AT_ONCE = 1000  # flights of a batch: so that the caches of a policy stay below 0.2 GB
-KEPT_FLIGHTS = 30  # of which eval.npz has the states, too
+AT_ONCE = 1000  # flights of a batch, so that the caches of a policy stay below 0.2 GB
+KEPT_FLIGHTS = 30  # flights whose states eval.npz keeps
 
 
 def draws(eval_seed: int, n: int) -> np.ndarray:
-    """The n draws (n, 13) of a seed: the same for every policy and guidance law."""
+    """The n draws (n, 13) of a seed. They are the same for every policy and guidance law."""
     return np.random.default_rng([eval_seed, 3]).random((n, len(DRAW)))
 
 
 def fly_draws(env_id: str, make_policy: Callable, z: np.ndarray, **env_options) -> dict:
-    """The arrays of `fly_lander` for draws z (n, 13), flown in batches; `make_policy(z)` gives the policy of a batch.
+    """The arrays of `fly_lander` for draws z (n, 13), flown in batches. `make_policy(z)` gives the policy of a batch.
 
-    y is that of the first `KEPT_FLIGHTS` alone.
+    y has only the first `KEPT_FLIGHTS` flights.
     """
     parts = []
     for first in range(0, len(z), AT_ONCE):
@@ -47,14 +47,14 @@ def fly_draws(env_id: str, make_policy: Callable, z: np.ndarray, **env_options) 
 
 
 def until(rows: np.ndarray, steps: int) -> np.ndarray:
-    """Rows (n, T, k) as (n, steps, k), NaN behind their own."""
+    """Rows (n, T, k) padded with NaN to (n, steps, k)."""
     padded = np.full((len(rows), steps, rows.shape[2]), np.nan)
     padded[:, : rows.shape[1]] = rows
     return padded
 
 
 def flight_metrics(flown: dict) -> dict:
-    """The metrics of flights, those of a reference excepted."""
+    """The metrics of flights, without those that need a reference."""
     position, speed = flown["position_error"], flown["speed"]
     is_soft = flown["down"] & (position < POSITION_LIMIT) & (speed < SPEED_LIMIT)
     return {
@@ -76,7 +76,7 @@ def flight_metrics(flown: dict) -> dict:
 
 
 def evaluate_policy(env_id: str, policy: Callable, reference: dict, eval_seed: int, n: int, **env_options):
-    """Fly `policy(obs (m, obs), t) -> action (m, 3)` on the n draws of a seed: (metrics, arrays)."""
+    """Fly `policy(obs (m, obs), t) -> action (m, 3)` on the n draws of a seed. Returns metrics and arrays."""
     flown = fly_draws(env_id, lambda z: policy, draws(eval_seed, n), **env_options)
     solved = np.flatnonzero(reference["solved"])
     batch: Any = gym.make_vec(env_id, num_envs=1, **env_options)  # a LanderVectorEnv
@@ -91,7 +91,7 @@ def evaluate_policy(env_id: str, policy: Callable, reference: dict, eval_seed: i
 
 
 def flight_arrays(flown: dict, reference: dict) -> dict:
-    """The arrays of eval.npz: flights by periods of `decision_s` seconds, in which a command is held."""
+    """The arrays of eval.npz. Flights are recorded by periods of `decision_s` seconds, in which a command is held."""
     kept = ("u", "effectiveness", "y", "start", "gravity", "draw", "final_y", "slope", "fuel_kg")
     arrays = {key: flown[key] for key in kept}
     arrays |= {"decision_s": np.array(PERIOD), "final_t": flown["final_time"]}

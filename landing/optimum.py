@@ -1,4 +1,4 @@
-"""Reference optima of the landers by IPOPT: the least propellant, knowing a flight's mass, gravity and failure.
+"""Reference optima of the landers by IPOPT: the least propellant if a flight's mass, gravity and failure are known.
 
 Reading order: a flight as it is solved, the nonlinear program, the solve from a guess, one flight's optimum and its
 replay by the environment, the references of many draws. CasADi is imported only where it is used.
@@ -25,31 +25,31 @@ from landing.lander import DRAW, LANDERS, Flights, Lander, check_failure, flight
 
 
 class Descent(NamedTuple):
-    """What is left of one flight, all of it known."""
+    """What is left of one flight, with all that is hidden."""
 
-    state: np.ndarray  # (7,) r (m), v (m/s), m (kg) at its beginning
+    state: np.ndarray  # (7,) r (m), v (m/s), m (kg) at the beginning
     gravity: np.ndarray  # (3,) m/s^2
-    failed: np.ndarray  # (3,) effectiveness of each axis once the failure has struck
-    strike: float  # s from the beginning on, when it does; infinite if never
+    failed: np.ndarray  # (3,) effectiveness of each axis after the failure
+    strike: float  # s after the beginning, when the failure strikes; infinite without one
 
     @classmethod
     def of(cls, flights: Flights, k: int) -> Descent:
-        """Flight k, from its start on."""
+        """The whole flight k."""
         state = np.concatenate([flights.r[:, k], flights.v[:, k], flights.mass[[k]]])
         strike = PERIOD * np.ceil(flights.strike[k] / PERIOD)  # the beginning of one of the environment's periods
         return cls(state, flights.gravity[:, k], flights.failed[:, k], float(strike))
 
     def effectiveness(self, begins: np.ndarray) -> np.ndarray:
-        """That of each axis in intervals that begin at these times (K,) in s, (K, 3)."""
+        """The effectiveness (K, 3) of each axis in intervals that begin at these times (K,) in s."""
         has_struck = begins > self.strike - PERIOD / 2
         return np.where(has_struck[:, None], self.failed, 1.0)
 
 
 class Trajectory(NamedTuple):
-    """A guess or solution: thrusts held between the times at which the states are."""
+    """A guess or solution: states at some times, and the thrusts held between them."""
 
     t: np.ndarray  # (K+1,) s
-    thrust: np.ndarray  # (K, 3) N, what acts on the lander
+    thrust: np.ndarray  # (K, 3) N, the thrust that acts on the lander
     y: np.ndarray  # (K+1, 7)
 
     @property
@@ -58,16 +58,16 @@ class Trajectory(NamedTuple):
 
     @property
     def fuel(self) -> float:
-        """kg."""
+        """The propellant burnt, in kg."""
         return float(self.y[0, 6] - self.y[-1, 6])
 
     def thrust_at(self, times: np.ndarray) -> np.ndarray:
-        """(k, 3) at times (k,); the first and last ones are held beyond the ends."""
+        """The thrusts (k, 3) at times (k,). The first and the last thrust are held beyond the ends."""
         interval = np.searchsorted(self.t, times, side="right") - 1
         return self.thrust[np.clip(interval, 0, len(self.thrust) - 1)]
 
     def state_at(self, times: np.ndarray) -> np.ndarray:
-        """(k, 7) at times (k,), on straight lines between the states."""
+        """The states (k, 7) at times (k,), on straight lines between the states."""
         return np.column_stack([np.interp(times, self.t, column) for column in self.y.T])
 
 
@@ -75,25 +75,25 @@ class Trajectory(NamedTuple):
 # The nonlinear program
 # ---------------------------------------------------------------------------------------------------------------------
 
-UNITS = np.array([1000.0] * 3 + [50.0] * 3 + [1000.0])  # m, m/s, kg: in them a state is of order 1
-BOX = 20.0  # units of r and v; far from any descent, it keeps IPOPT's first steps near the pad
+UNITS = np.array([1000.0] * 3 + [50.0] * 3 + [1000.0])  # m, m/s, kg; in these units a state is of order 1
+BOX = 20.0  # units of r and v; no descent comes near it, but it keeps IPOPT's first steps near the pad
 TOUCHDOWN = np.array([0.0, 0.0, -1e-7, 0.0, 0.0, -0.01])  # m and m/s; at rest it might miss the ground by rounding
-CLEARANCE = 0.1  # m, at the ends of periods: between them the path sags by up to 0.05 m
-LAST_APPROACH = 1.0  # s before touchdown, in which it may come nearer to the ground
-SHORTEST, LONGEST = 0.02, 10.0  # s, of an interval
-MAX_ITERATIONS = 300  # a landing that exists took 14 to 90
+CLEARANCE = 0.1  # m at the ends of periods, because the path sags between them by up to 0.05 m
+LAST_APPROACH = 1.0  # s before touchdown, in which the path may come nearer to the ground
+SHORTEST, LONGEST = 0.02, 10.0  # s, the bounds of an interval's length
+MAX_ITERATIONS = 300  # a landing that exists takes 14 to 90
 
 
 class Mesh(NamedTuple):
-    """The intervals of a program, some of them of one unknown length."""
+    """The intervals of a program. Some have a fixed length, the free ones share one unknown length."""
 
-    fixed: np.ndarray  # (K,) s, the lengths of the others, 0 in these
-    is_free: np.ndarray  # (K,)
-    longest: float  # s, bound of the unknown length
+    fixed: np.ndarray  # (K,) s, the fixed lengths, 0 for free intervals
+    is_free: np.ndarray  # (K,) which intervals are free
+    longest: float  # s, upper bound of the unknown length
 
     @classmethod
     def stretched(cls, count: int, seconds: float, strike: float = 0.0) -> Mesh:
-        """Intervals of about like length where the landing takes `seconds`; those before the strike (s) are fixed."""
+        """Intervals of about like length for a landing that takes `seconds`. Those before the strike (s) are fixed."""
         before = 0
         if strike > 0:
             before = min(max(round(count * strike / seconds), 1), count - 1)
@@ -102,16 +102,16 @@ class Mesh(NamedTuple):
 
     @classmethod
     def periods(cls, count: int) -> Mesh:
-        """The environment's, the last one cut short."""
+        """The environment's periods. The last one is cut short."""
         is_last = np.arange(count) == count - 1
         return cls(np.where(is_last, 0.0, PERIOD), is_last, PERIOD)
 
     def times(self, length: float) -> np.ndarray:
-        """The ends (K+1,) of the intervals, s, for a length of the free ones."""
+        """The ends (K+1,) of the intervals in s, if the free ones have this length."""
         return np.append(0.0, np.cumsum(self.fixed + self.is_free * length))
 
     def length(self, seconds: float) -> float:
-        """That of the free intervals where all together last `seconds`, within its bounds."""
+        """The length of the free intervals with which all together last `seconds`, clipped to its bounds."""
         return float(np.clip((seconds - self.fixed.sum()) / self.is_free.sum(), SHORTEST, self.longest))
 
 
@@ -122,10 +122,13 @@ def interval_of(lander: Lander):
     """
     import casadi as ca
 
-    y, thrust, seconds = ca.SX.sym("y", 7), ca.SX.sym("thrust", 3), ca.SX.sym("seconds")
-    gravity, effectiveness = ca.SX.sym("gravity", 3), ca.SX.sym("effectiveness", 3)
+    y = ca.SX.sym("y", 7)
+    thrust = ca.SX.sym("thrust", 3)
+    seconds = ca.SX.sym("seconds")
+    gravity = ca.SX.sym("gravity", 3)
+    effectiveness = ca.SX.sym("effectiveness", 3)
     state = y * ca.DM(UNITS)
-    norm = ca.sqrt(ca.sumsqr(thrust) + 1e-16)  # at 0 the root has no derivative
+    norm = ca.sqrt(ca.sumsqr(thrust) + 1e-16)  # the root has no derivative at 0
     flow = lander.greatest_thrust * norm / lander.exhaust
     motion = state[:3], state[3:6], state[6], thrust / norm, flow, gravity, seconds
     after = ca.vertcat(*burn(*motion, lander.exhaust, log1p=ca.log1p)) / ca.DM(UNITS)
@@ -137,23 +140,29 @@ def interval_of(lander: Lander):
 def landing_solver(lander: Lander, count: int, has_cone: bool):
     """IPOPT for a landing in `count` intervals, built once per process.
 
-    Unknowns: the thrusts (3, count), the states (7, count) at the intervals' ends, the length of the free intervals.
-    Parameters: state, gravity, effectiveness (3, count), `Mesh.fixed`, `Mesh.is_free`, the tangent of the glide slope.
-    Minimises the propellant. Constraints: the states are continuous (7 count, = 0), |thrust|^2 and |command|^2 (count
-    each, bounded), with `has_cone` how high the ends of all intervals but the last are above the cone (count - 1).
+    - unknowns: the thrusts (3, count), the states (7, count) at the intervals' ends, the length of the free intervals
+    - parameters: state, gravity, effectiveness (3, count), `Mesh.fixed`, `Mesh.is_free`, the glide slope's tangent
+    - cost: the propellant
+    - constraints: continuous states (7 count, = 0), |thrust|^2 and |command|^2 (count each, bounded), and with
+      `has_cone` the heights above the cone at the ends of all intervals but the last (count - 1)
     """
     import casadi as ca
 
-    thrust, y, length = ca.MX.sym("thrust", 3, count), ca.MX.sym("y", 7, count), ca.MX.sym("length")
-    state, gravity, tangent = ca.MX.sym("state", 7), ca.MX.sym("gravity", 3), ca.MX.sym("tangent")
+    thrust = ca.MX.sym("thrust", 3, count)
+    y = ca.MX.sym("y", 7, count)
+    length = ca.MX.sym("length")
+    state = ca.MX.sym("state", 7)
+    gravity = ca.MX.sym("gravity", 3)
+    tangent = ca.MX.sym("tangent")
     effectiveness = ca.MX.sym("effectiveness", 3, count)
-    fixed, is_free = ca.MX.sym("fixed", 1, count), ca.MX.sym("is_free", 1, count)
+    fixed = ca.MX.sym("fixed", 1, count)
+    is_free = ca.MX.sym("is_free", 1, count)
     before = ca.horzcat(state, y[:, :-1])
     held = thrust, fixed + is_free * length, ca.repmat(gravity, 1, count), effectiveness
     after, thrusts, commands = interval_of(lander).map(count)(before, *held)
     constraints = [y - after, thrusts, commands]
     if has_cone:
-        run = ca.sqrt(ca.sum1(y[:2, :-1] ** 2) + 1e-12)  # above the pad the root has no derivative
+        run = ca.sqrt(ca.sum1(y[:2, :-1] ** 2) + 1e-12)  # the root has no derivative above the pad
         constraints.append(y[2, :-1] - tangent * run)
     program = {
         "x": ca.veccat(thrust, y, length),
@@ -174,14 +183,15 @@ def landing_solver(lander: Lander, count: int, has_cone: bool):
 
 
 def bounds_of(lander: Lander, mesh: Mesh, glide_slope: float | None, limits: tuple[float, float]) -> dict:
-    """The bounds of a program's unknowns and constraints, as `nlpsol` takes them; `limits` of the thrust in N."""
+    """The bounds of a program's unknowns and constraints, for CasADi's `nlpsol`. `limits` of the thrust are in N."""
     count = len(mesh.fixed)
-    low, high = np.full((count, 7), -BOX), np.full((count, 7), BOX)
+    low = np.full((count, 7), -BOX)
+    high = np.full((count, 7), BOX)
     low[:, 6] = lander.dry_mass / UNITS[6]
     high[:, 6] = np.inf
     if glide_slope is not None:
         times = mesh.times(SHORTEST)
-        left = times[-1] - times[1:]  # s, at least
+        left = times[-1] - times[1:]  # s that are left at least
         low[:, 2] = np.where(left > LAST_APPROACH, CLEARANCE / UNITS[2], 0.0)
     low[-1, :6] = high[-1, :6] = TOUCHDOWN / UNITS[:6]
     ones = np.ones(3 * count)
@@ -203,22 +213,23 @@ def bounds_of(lander: Lander, mesh: Mesh, glide_slope: float | None, limits: tup
 # The solve from a guess
 # ---------------------------------------------------------------------------------------------------------------------
 
-NEWTON_STEPS = 25  # 8 are enough for almost all; each of the others at least halves the bracket
+NEWTON_STEPS = 25  # 8 are enough for almost all flights; a bisection halves the bracket of the others
 
 
 def energy_optimal_time(r, v, gravity: float) -> np.ndarray:
-    """Time to go (n,) in s of the energy-optimal landing from r, v (n, 3), with |g| in m/s^2.
+    """The time to go (n,) in s of the energy-optimal landing from r and v (n, 3). gravity is |g| in m/s^2.
 
-    D'Souza, "An optimal guidance law for planetary landing" (AIAA 97-3709): the positive root t of
+    It is the positive root t of an equation by D'Souza, "An optimal guidance law for planetary landing" (AIAA 97-3709):
 
         g^2/2 t^4 - 2 v.v t^2 - 12 v.r t - 18 r.r = 0,  which is  g t^2 / 2 = |3 r + v t|.
 
-    The second form has no differences of large numbers. With v^2 below 6 g |r|, as on all our descents, there is one
-    root. Newton's method, begun above it; a step that leaves the bracket is replaced by its middle.
+    The second form has no differences of large numbers. There is one root if v^2 is below 6 g |r|, as on all our
+    descents. We find it by Newton's method from above. A step that leaves the bracket is replaced by its middle.
     """
-    distance, speed = np.linalg.norm(r, axis=1), np.linalg.norm(v, axis=1)
+    distance = np.linalg.norm(r, axis=1)
+    speed = np.linalg.norm(v, axis=1)
     low = np.zeros(len(r))
-    high = (speed + np.sqrt(speed**2 + 6 * gravity * distance)) / gravity  # where g t^2 / 2 = 3 |r| + |v| t
+    high = (speed + np.sqrt(speed**2 + 6 * gravity * distance)) / gravity  # the root of g t^2 / 2 = 3 |r| + |v| t
     t = high
     for _ in range(NEWTON_STEPS):
         aim = 3 * r + v * t[:, None]
@@ -233,7 +244,7 @@ def energy_optimal_time(r, v, gravity: float) -> np.ndarray:
 
 
 def straight_line(lander: Lander, descent: Descent, seconds: float, count: int) -> Trajectory:
-    """A guess: r, v and m change evenly, under the thrust that stops the lander in this time."""
+    """A guess in which r, v and m change evenly, under the thrust that stops the lander in `seconds`."""
     share = np.linspace(0, 1, count + 1)
     thrust = descent.state[6] * (-descent.state[3:6] / seconds - descent.gravity)
     norm = np.linalg.norm(thrust)
@@ -253,15 +264,16 @@ def solve_from_guess(
     glide_slope: float | None = 0.0,
     limits: tuple[float, float] | None = None,
 ) -> Trajectory:
-    """The path of least propellant to the pad, with the engine's limits or others (N).
+    """The path of least propellant to the pad, within the thrust `limits` (N), by default the engine's.
 
-    `glide_slope` in degrees: the path stays above this cone on the pad; 0: above the ground; None: anywhere. The
-    failure strikes at the beginning of an interval. Raises NoOptimum where IPOPT finds none.
+    The path stays above a cone on the pad, with the angle `glide_slope` in degrees. 0 keeps it above the ground, None
+    allows any path. The failure strikes at the beginning of an interval. Raises NoOptimum if IPOPT finds none.
     """
     count = len(mesh.fixed)
     length = mesh.length(guess.seconds)
     t = mesh.times(length)
-    thrust, y = guess.thrust_at((t[:-1] + t[1:]) / 2), guess.state_at(t[1:])
+    thrust = guess.thrust_at((t[:-1] + t[1:]) / 2)
+    y = guess.state_at(t[1:])
     unknowns = [(thrust / lander.greatest_thrust).ravel(), (y / UNITS).ravel(), [length]]
     effectiveness = descent.effectiveness(t[:-1])
     tangent = np.tan(np.radians(glide_slope or 0.0))
@@ -282,19 +294,19 @@ def solve_from_guess(
 # The optimum of one flight, and its replay
 # ---------------------------------------------------------------------------------------------------------------------
 
-INTERVALS = 60  # of the solve that finds out how long the flight is
-DURATIONS = (0.8, 1.2, 0.6)  # guesses, in units of the energy-optimal time
-PERIODS_TRIES = 6  # numbers of periods, until the last one is within its bounds
+INTERVALS = 60  # intervals of the first solve, which finds out how long the flight is
+DURATIONS = (0.8, 1.2, 0.6)  # guessed durations, in units of the energy-optimal time
+PERIODS_TRIES = 6  # numbers of periods that are tried, until the last period is within its bounds
 POSITION_TOLERANCE = 0.01  # m
 SPEED_TOLERANCE = 0.02  # m/s
-FUEL_TOLERANCE = 0.05  # kg; at full thrust 4 ms
+FUEL_TOLERANCE = 0.05  # kg, which full thrust burns in 4 ms
 
 
 def stretched_optimum(lander: Lander, descent: Descent, glide_slope: float | None, clock: SolveClock) -> Trajectory:
-    """The optimum in `INTERVALS` that stretch, from the first guess that IPOPT takes there.
+    """The optimum in `INTERVALS` that stretch, from the first guess that leads IPOPT to one.
 
-    Where the lander is down before the failure strikes, the failure does not matter. Else the strike cuts the flight
-    into two arcs.
+    If the lander is down before the failure strikes, the failure does not matter. Otherwise the strike cuts the flight
+    into two arcs. Raises NoOptimum if no guess leads to one.
     """
     r, v = descent.state[None, :3], descent.state[None, 3:6]
     energy_optimal = float(energy_optimal_time(r, v, lander.gravity)[0])
@@ -320,7 +332,7 @@ def stretched_optimum(lander: Lander, descent: Descent, glide_slope: float | Non
 def held_optimum(
     lander: Lander, descent: Descent, guess: Trajectory, glide_slope: float | None, clock: SolveClock
 ) -> Trajectory:
-    """The optimum in the environment's periods. Where the last one ends at a bound, their number is changed by one."""
+    """The optimum in the environment's periods. If the last one ends at a bound, their number is changed by one."""
     count = int(guess.seconds / PERIOD) + 1
     tried: dict[int, Trajectory] = {}
     failure = NoOptimum("landing: no time to solve it")
@@ -342,19 +354,22 @@ def held_optimum(
 
 
 def optimise_landing(lander: Lander, flights: Flights, k: int, glide_slope: float | None = 0.0) -> dict:
-    """The least propellant that lands flight k, knowing its mass, gravity and failure.
+    """The landing of flight k with the least propellant, if its mass, gravity and failure are known.
 
-    Returns u (T, 3) N, the commands held for a period each, `fuel_kg`, `final_time` (s), and t (T+1,) and y (T+1, 7) of
+    Returns u (T, 3) in N, commands held for a period each, `fuel_kg`, `final_time` (s), and t (T+1,) and y (T+1, 7) of
     the flight that the environment makes of them. `glide_slope` is that of `solve_from_guess`. A path that may go below
-    ground (None) has no such flight: it is shot through the dynamics instead. Raises NoOptimum where IPOPT finds none,
-    or the replay does not end at rest on the pad with the solution's propellant.
+    ground (None) cannot be flown by the environment. It is shot through the dynamics instead. Raises NoOptimum if IPOPT
+    finds none, or if the replay does not end at rest on the pad with the solution's propellant.
     """
     descent = Descent.of(flights, k)
     clock = SolveClock("landing")
     stretched = stretched_optimum(lander, descent, glide_slope, clock)
     path = held_optimum(lander, descent, stretched, glide_slope, clock)
     u = path.thrust / descent.effectiveness(path.t[:-1])
-    y, end = shot(lander, descent, path) if glide_slope is None else replayed(lander, flights, k, u)
+    if glide_slope is None:
+        y, end = shot(lander, descent, path)
+    else:
+        y, end = replayed(lander, flights, k, u)
     position_error, speed = np.linalg.norm(y[-1, :3]), np.linalg.norm(y[-1, 3:6])
     is_soft = position_error < POSITION_TOLERANCE and speed < SPEED_TOLERANCE
     differs = len(y) != len(path.y) or not abs(path.y[-1, 6] - y[-1, 6]) < FUEL_TOLERANCE
@@ -383,7 +398,7 @@ def replayed(lander: Lander, flights: Flights, k: int, u: np.ndarray) -> tuple[n
 
 
 def shot(lander: Lander, descent: Descent, path: Trajectory) -> tuple[np.ndarray, float]:
-    """The states (T+1, 7) that a path's thrusts lead to, with no ground in their way, and its duration."""
+    """The states (T+1, 7) that a path's thrusts lead to without any ground, and the path's duration in s."""
     y = [descent.state]
     for thrust, seconds in zip(path.thrust, np.diff(path.t)):
         norm = np.linalg.norm(thrust)
@@ -402,9 +417,9 @@ def shot(lander: Lander, descent: Descent, path: Trajectory) -> tuple[np.ndarray
 def references(env_id: str, draw: np.ndarray, processes: int = 1, **env_options) -> dict:
     """The fuel optima of draws (n, 13): `fuel_kg` and `final_time` (n,), u (n, T, 3), y (n, T+1, 7), `solved` (n,).
 
-    Of the environment's options those of the failure matter. u and y are NaN behind a flight's last period, everything
-    where `solved` is False. What was asked for lately is remembered, in arrays that cannot be written to. Solves are
-    shared out to `processes`, which changes only the time. Raises NoOptimum where no draw has an optimum.
+    Only the failure's options of the environment matter. u and y are NaN after a flight's last period. All is NaN where
+    `solved` is False. Recent answers are remembered, in read-only arrays. `processes` share the solves, which changes
+    only the time. Raises NoOptimum if no draw has an optimum.
     """
     check_options(LanderVectorEnv, env_options)
     lander = LANDERS[env_id]
@@ -422,7 +437,7 @@ def references(env_id: str, draw: np.ndarray, processes: int = 1, **env_options)
 
 @lru_cache(maxsize=8)
 def kept_references(lander: Lander, rows: bytes, failure: tuple, processes: int) -> dict:
-    """As `references`; the draws are the bytes of their array. Equal flights are solved once."""
+    """`references` of draws that are given as the bytes of their array. Equal flights are solved once."""
     draw = np.frombuffer(rows).reshape(-1, len(DRAW))
     drawn = flights(lander, draw, *failure)
     _, first, of_draw = np.unique(np.vstack(drawn), axis=1, return_index=True, return_inverse=True)
@@ -451,13 +466,13 @@ def kept_references(lander: Lander, rows: bytes, failure: tuple, processes: int)
 
 
 def solutions(jobs: list, processes: int) -> list:
-    """What `solve_job` returns of each job, in their order."""
+    """What `solve_job` returns for each job, in the jobs' order."""
     with Workers(processes) as workers:
         return workers.map(solve_job, jobs)
 
 
 def solve_job(job) -> dict | NoOptimum:
-    """The optimum of (lander, flights, k), or why there is none."""
+    """The optimum of the job (lander, flights, k), or the NoOptimum that says why there is none."""
     try:
         return optimise_landing(*job)
     except NoOptimum as error:

@@ -1,4 +1,7 @@
-"""`python baselines.py MarsLanding-v0`, and of any lander by its id: solve, print rows; the numbers and arrays."""
+"""`python baselines.py MarsLanding-v0`, or the same with another lander's id: solve the optima and print rows.
+
+The functions return the numbers and arrays for the files.
+"""
 
 from __future__ import annotations
 
@@ -14,12 +17,14 @@ CONSTRAINTS = {"no constraint on the path": None, "altitude at least 0": 0.0, "g
 
 
 def report_lander(env_id: str, starts: int, seed: int) -> tuple[dict, dict]:
-    """Solve and print a lander's optima: of one start with each constraint, else of the draws of a seed."""
-    return report_constraints(env_id) if LANDERS[env_id].has_one_flight else report_draws(env_id, starts, seed)
+    """Solve and print a lander's optima: with each constraint if it has one start, else for the draws of a seed."""
+    if LANDERS[env_id].has_one_flight:
+        return report_constraints(env_id)
+    return report_draws(env_id, starts, seed)
 
 
 def report_constraints(env_id: str) -> tuple[dict, dict]:
-    """The optima of a lander's one start."""
+    """Solve and print the optima of a lander's one start, with each of `CONSTRAINTS`."""
     lander = LANDERS[env_id]
     flight = flights(lander, draws(0, 1), 0.0, 1.0, "start")
     numbers, arrays = {}, {}
@@ -37,7 +42,10 @@ def report_constraints(env_id: str) -> tuple[dict, dict]:
 
 
 def report_draws(env_id: str, starts: int, seed: int) -> tuple[dict, dict]:
-    """The optima of the first draws of a seed, by the lander's own failures: all, healthy and failed flights."""
+    """Solve and print the optima of the first draws of a seed, with the lander's own failures.
+
+    There is a row for all flights, one for the healthy ones and one for the failed ones.
+    """
     lander = LANDERS[env_id]
     z = draws(seed, starts)
     began = time.monotonic()

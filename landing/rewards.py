@@ -1,4 +1,4 @@
-"""What a landing earns, and when a lander has landed. The conditions are the published ones, the rewards ours."""
+"""The rewards of a landing, and when a lander has landed. The conditions are published, the rewards are ours."""
 
 from __future__ import annotations
 
@@ -10,33 +10,34 @@ SPEED_LIMIT = 2.0  # m/s
 SLOPE_LIMIT = 5.0  # fall over run, from the last position that was more than `SLOPE_HEIGHT` higher
 SLOPE_HEIGHT = 2.0  # m
 
-# of the reported return; a training may set others
+# the scales and prices of the reported return; a training may set others
 POSITION_SCALE = 0.1  # m
 SPEED_SCALE = 0.1  # m/s
 FAR = 20.0  # m
 FAST = 5.0  # m/s
 FUEL_PRICE = 1.0  # for 100 kg
-ALOFT_PRICE = 10.0  # where a flight ends in the air
+ALOFT_PRICE = 10.0  # for a flight that ends in the air
 SLOPE_PRICE = 2.0
 STEEP = 10.0  # a steeper slope pays no more
 FLATTEST = 0.05  # a flatter slope costs no more
 
 
 def has_landed(position_error, speed, slope, is_down):
-    """Whether flights have landed by the published conditions, (n,)."""
+    """The flights (n,) that have landed by the published conditions, as a mask."""
     return is_down & (position_error < POSITION_LIMIT) & (speed < SPEED_LIMIT) & (slope > SLOPE_LIMIT)
 
 
 def terminal_reward(position_error, speed, position_scale, speed_scale):
     """-ln(1 + |r| / position_scale) - ln(1 + |v| / speed_scale) - |r| / 20 m - |v| / 5 m/s.
 
-    Each halving of an error pays the same. Two logarithms and not one of a norm: the larger error does not hide the
-    smaller one. The linear terms outweigh the propellant that is saved by giving up a far pad, or the braking.
+    Each halving of an error pays the same. There are two logarithms, not one of a norm, so the larger error does not
+    hide the smaller one. The linear terms outweigh the propellant that a flight saves by giving up a far pad or the
+    braking.
     """
     near = np.log1p(position_error / position_scale) + np.log1p(speed / speed_scale)
     return -near - position_error / FAR - speed / FAST
 
 
 def slope_reward(slope, price):
-    """-price ln(10 / slope), not above 0: each doubling of a flat slope pays the same, well past the limit of 5."""
+    """-price ln(10 / slope), at most 0. Each doubling of a flat slope pays the same, well beyond the limit of 5."""
     return -price * np.log(np.maximum(STEEP / np.maximum(slope, FLATTEST), 1.0))

@@ -37,7 +37,7 @@ def table(metrics: dict) -> str:
 
 
 def failure_lines(metrics: dict) -> list[str]:
-    """What the flights had to master."""
+    """The lines below the table about the failures. There are none without failures."""
     if not metrics["failure_probability"]:
         return []
     when = "at a random moment" if metrics["failure_time"] == "random" else "from the start"

@@ -1,4 +1,4 @@
-"""What is asked of a lander's id: see `common.tasks.Task`."""
+"""The landers' family: its answers to what `common.tasks.Task` asks of an id."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from landing.optimum import references
 from landing.report import report_lander
 from landing.table import table
 
-INTERIM_FLIGHTS = 50  # of an evaluation during a training
-BRIEF_FLIGHTS = 10  # of the reported evaluation of a training cut short
+INTERIM_FLIGHTS = 50  # flights of an evaluation during a training
+BRIEF_FLIGHTS = 10  # flights of the reported evaluation after a training cut short
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class LanderTask(GroundTask):
         return {"draw": draws(eval_seed, n)}
 
     def optimum(self, eval_seed: int, n: int, **env_options) -> dict:
-        """Of the first `REFERENCE_STARTS` draws at most, knowing all that is drawn; flown by periods of 0.2 s."""
+        """The optima of at most the first `REFERENCE_STARTS` draws, which know the draws, in periods of 0.2 s."""
         failure = {key: value for key, value in env_options.items() if key.startswith("failure_")}
         are_alike = self.lander.has_one_flight and not failure.get("failure_probability")
         z = draws(eval_seed, 1 if are_alike else min(n, REFERENCE_STARTS))
@@ -91,7 +91,7 @@ class LanderTask(GroundTask):
         return ["landed_rate", "position_error_mean_m", "speed_mean_m_s", "fuel_ratio"]
 
     def headline(self, metrics: dict) -> str:
-        """A figure's title: how many landed, and on how much propellant."""
+        """A figure's title: how many flights landed, and with how much propellant."""
         landed = f"{metrics['landed_rate']:.2%} of {metrics['eval_starts']} flights landed"
         return f"{self.env_id}: {landed}, propellant {metrics['fuel_ratio']:.3f} x optimum"
 
@@ -107,7 +107,7 @@ class LanderTask(GroundTask):
         return figures
 
     def training_figure(self, metrics: dict, curves: list[dict]):
-        """The curves of a training, with the mean action's position error."""
+        """The training curves, with the position error of the mean action."""
         from drawing.training import Miss, training_figure
 
         miss = Miss("eval/position_error_mean_m", "position error (m), mean action")
@@ -125,7 +125,7 @@ class LanderTask(GroundTask):
         return of_flights | {"y_reference", "fuel_kg_reference"}
 
     def kept_arrays(self, arrays: dict) -> dict:
-        """Of the first `KEPT_FLIGHTS`; all arrays but the period are by flight."""
+        """The arrays of the first `KEPT_FLIGHTS` flights. All arrays but the period are by flight."""
         return {key: array if key == "decision_s" else array[:KEPT_FLIGHTS] for key, array in arrays.items()}
 
     # --- what is taken along
@@ -142,7 +142,7 @@ class LanderTask(GroundTask):
     # --- commands
 
     def speed_cases(self) -> list[tuple[str, dict, list | None]]:
-        """Thrust that carries the weight."""
+        """The lander hovers in this case, with a thrust that carries its weight."""
         return [("", {}, [0.0, 0.0, self.lander.mass * self.lander.gravity / self.lander.greatest_thrust])]
 
     def add_arguments(self, parser) -> None:
@@ -158,9 +158,9 @@ class LanderTask(GroundTask):
 
 
 def held(u: np.ndarray, lander: Lander):
-    """The policy that flies commands u (n, T, 3) N period by period.
+    """The policy that flies the commands u (n, T, 3) in N, period by period.
 
-    Behind a row's end it repeats the last command; of a row without one it gives no thrust.
+    After a row's end it repeats the last command. A row without commands gives no thrust.
     """
     last = np.maximum(np.isfinite(u[:, :, 0]).sum(axis=1) - 1, 0)
     rows = np.arange(len(u))

@@ -1,6 +1,6 @@
-"""One self-contained HTML file of what a family's `page` hands over: template, style, scripts and data inlined.
+"""One self-contained HTML file of a family's `Page`, with template, style, scripts and data in it.
 
-The scripts are plain JavaScript files of this folder, read in the order of `KINDS` into one global scope.
+The scripts are plain JavaScript files of this folder. They are read in the order of `KINDS` into one global scope.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ UNUSED = ("critic.", "actor_logstd")  # tensors that no evaluation needs
 
 
 class Page(NamedTuple):
-    """What a page shows."""
+    """The content of a page."""
 
     kind: str  # one of KINDS: `<kind>.html` and its scripts
     title: str
@@ -47,7 +47,7 @@ def html_bytes(page: Page) -> bytes:
 
 
 def script(name: str) -> str:
-    """A script as an element of the page; behind a library its license."""
+    """A script as an element of the page, with the license of a library before it."""
     path = HERE / name
     license_path = path.with_name(f"{path.name.split('.')[0]}.LICENSE")
     terms = f"/*\n{license_path.read_text()}*/\n" if license_path.exists() else ""
@@ -55,9 +55,9 @@ def script(name: str) -> str:
 
 
 def encoded(value):
-    """An array as JSON holds it, {dtype, shape, base64}; a number of NumPy as a plain one.
+    """A value for JSON: an array as {dtype, shape, base64}, a NumPy number as a plain number.
 
-    Weights that were rounded to bfloat16 are written as such, in half the bytes: nothing is lost.
+    Weights that were rounded to bfloat16 are written as bfloat16. They take half the bytes, and nothing is lost.
     """
     if isinstance(value, np.generic):
         return value.item()
@@ -70,9 +70,9 @@ def encoded(value):
 
 
 def network(checkpoint: dict, inputs: int) -> dict:
-    """A policy's network for policy.js, of what `read_checkpoint` returns; `inputs` is the number of its features.
+    """A policy's network for policy.js, from the answer of `read_checkpoint`. `inputs` is the number of its features.
 
-    BadInput where the policy was trained on other features.
+    Raises BadInput if the policy was trained with other features.
     """
     tensors, args = checkpoint["tensors"], checkpoint["args"]
     wide = tensors["encoder.0.weight"].shape[1] if "encoder.0.weight" in tensors else 0

@@ -1,4 +1,4 @@
-"""The small problems' picture that moves: the phase plane, with position and control over time, or all over time."""
+"""The small problems' animation: the phase plane, with position and control over time, or all states over time."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from phased.problem import Problem
 
 
 class PhasePlane(Sheet):
-    """The phase plane with the circles, beside it position and control over time; any number of flights."""
+    """The phase plane with the circles, and beside it position and control over time, for any number of flights."""
 
     def __init__(self, problem: Problem, title: str = "", compared: bool = False):
         super().__init__(title or problem.env_id)
@@ -44,7 +44,7 @@ class PhasePlane(Sheet):
         return ax.add_collection(LineCollection([], zorder=4, **look), autolim=False)
 
     def _mark_phases(self):
-        """Green: each phase's circle, and its target over the phase's time."""
+        """Draw in green each phase's circle, and its target over the phase's time."""
         self.circles, self.ends, start = [], [], 0.0
         for k, phase in enumerate(self.problem.phases, start=1):
             target = self.problem.targets_of(phase)
@@ -70,7 +70,7 @@ class PhasePlane(Sheet):
         self.figure.legend(handles=handles, loc="lower center", ncols=len(handles), fontsize=8, frameon=False)
 
     def fit(self, flights: list[Flight]):
-        """Axes that hold all these flights."""
+        """Set axes that hold all these flights."""
         points = np.concatenate([flight.y for flight in flights])
         x, y = room(1.15, 1.05 * points[:, 0]), room(1.15, 1.05 * points[:, 1])
         _, _, width, height = self.plane.get_position().bounds
@@ -80,7 +80,7 @@ class PhasePlane(Sheet):
         self.position.set(ylim=(-x, x))
 
     def show(self, *sides: list[Flight], ended: bool = False):
-        """Draw the flights of each side (the policy's; then the optimum's) as far as they go; `pixels` is the frame."""
+        """Draw the flights of each side so far: the policy's, then the optimum's. `pixels` gives the frame."""
         for flights, (plane, position, control), head in zip(sides, self.lines, self.heads):
             plane.set_segments([flight.y for flight in flights])
             position.set_segments([np.column_stack([flight.t, flight.y[:, 0]]) for flight in flights])

@@ -1,4 +1,4 @@
-"""What a table can get wrong: each slip is BadInput, one line that names the field, its value and what is allowed."""
+"""Checks of a table. Each slip raises BadInput with one line that names the field, its value and what is allowed."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from common.errors import BadInput, is_finite, refuse_unless
 
 ENV_ID = re.compile(r"[A-Za-z0-9_.-]+-v\d+")
 TRIALS = 8  # points at which the table's functions are tried
-LARGEST_STEP_ERROR = 0.01  # of a Runge-Kutta step, in `x_scale`: beyond it the integrator is far from the dynamics
+LARGEST_STEP_ERROR = 0.01  # error of a Runge-Kutta step in `x_scale`; a larger one is far from the dynamics
 
 
 def check_problem(problem):
-    """Refuse a `Problem` that cannot be flown. Sizes and signs first, then its functions are tried."""
+    """Refuse a `Problem` that cannot be flown. Sizes and signs are checked first, then its functions are tried."""
     named = isinstance(problem.env_id, str) and ENV_ID.fullmatch(problem.env_id)
     refuse_unless(named, "env_id", repr(problem.env_id), "must be letters, digits, _ . - and a version, as 'Mine-v0'")
     for name in ("f", "parameters", "guess"):
@@ -35,7 +35,7 @@ def check_problem(problem):
 
 
 def refuse(problem, possible, field: str, value, allowed: str):
-    """BadInput that names the table, too."""
+    """Raise BadInput that also names the table, unless `possible`."""
     refuse_unless(possible, f"{field} of {problem.env_id}", one_line(value), allowed)
 
 
@@ -110,7 +110,7 @@ def check_starts(problem, n: int):
 
 
 def check_rows(problem, n: int, n_states: str):
-    """What has one entry for each state or control."""
+    """The fields with one entry for each state or control."""
     scale = problem.x_scale
     possible = scale is None or (is_tuple_of(positive, scale) and len(scale) == n)
     refuse(problem, possible, "x_scale", scale, f"must be {n} positive {n_states}")
@@ -173,7 +173,7 @@ def check_phase(problem, phase, k: int):
 
 
 def try_functions(problem):
-    """Call the table's functions at a few points; their sizes, NaN, and what NumPy arrays or CasADi could not take."""
+    """Call the table's functions at a few points. Refuse wrong sizes, NaN, and what arrays or CasADi cannot take."""
     rng = np.random.default_rng(0)
     draw = problem.draw_scores(rng, TRIALS)
     p = ()
@@ -214,7 +214,7 @@ def try_functions(problem):
 
 
 def check_step(problem, phase, x, u, p):
-    """BadInput where a step is too long for its Runge-Kutta formula: two half steps end elsewhere."""
+    """Raise BadInput if a step is too long for its Runge-Kutta formula, so that two half steps end elsewhere."""
     with np.errstate(all="ignore"):
         whole_step, _ = problem.step(phase, x, u, p, problem.dt)
         half, _ = problem.step(phase, x, u, p, problem.dt / 2)
@@ -238,7 +238,7 @@ HINTS = (  # a part of an error's message -> its usual cause
 
 
 def attempt(problem, field: str, function: Callable, *arguments):
-    """What a function of the table returns; BadInput with the usual cause where it fails."""
+    """What a function of the table returns. Raises BadInput with the usual cause if it fails."""
     try:
         with np.errstate(all="ignore"), warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -250,7 +250,7 @@ def attempt(problem, field: str, function: Callable, *arguments):
 
 
 def check_size(problem, field: str, values, count: int):
-    """BadInput unless a function returned a tuple of `count` values."""
+    """Raise BadInput unless a function returned a tuple of `count` values."""
     if not isinstance(values, tuple):
         allowed = f"must be a tuple of {count}, one for each state (write the components of a matrix product)"
         refuse(problem, False, f"what {field} returns", f"a {type(values).__name__}", allowed)
@@ -258,7 +258,7 @@ def check_size(problem, field: str, values, count: int):
 
 
 def as_rows(problem, field: str, values) -> tuple:
-    """The values as arrays (TRIALS,), all finite; BadInput names the field."""
+    """The values as finite arrays (TRIALS,). Raises BadInput with the field's name for others."""
     rows = []
     for value in values:
         try:
@@ -281,7 +281,7 @@ def read_only(rows: np.ndarray) -> np.ndarray:
 
 
 def whole(problem, name: str, value, least: int):
-    """BadInput unless a whole number of at least `least`."""
+    """Raise BadInput unless `value` is a whole number of at least `least`."""
     possible = isinstance(value, int | np.integer) and value >= least
     refuse(problem, possible, name, value, f"must be a whole number of at least {least}")
 
@@ -299,10 +299,12 @@ def is_tuple_of(kind: Callable, value) -> bool:
 
 
 def is_bound(pair) -> bool:
-    """Whether an entry of `bounds` is one."""
+    """Whether `pair` can be an entry of `bounds`."""
     if pair is None:
         return True
-    if not (isinstance(pair, tuple) and len(pair) == 2 and all(end is None or is_finite(end) for end in pair)):
+    if not isinstance(pair, tuple) or len(pair) != 2:
+        return False
+    if not all(end is None or is_finite(end) for end in pair):
         return False
     low, high = pair
     return low is None or high is None or low < high

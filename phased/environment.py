@@ -15,40 +15,49 @@ from common.errors import BadInput, refuse_unless
 from common.integration import falling_root
 from phased.problem import LARGEST_SCORE, PROBLEMS, Phase, Problem
 
-# the observed target moves to the new waypoint over these first steps of a phase: the paper's number, linearly by ours
+# The observed target moves to the new waypoint over these first steps of a phase. The number is the paper's. That it
+# moves linearly is our choice.
 TRANSITION_STEPS = 5
 
 
 class PhasedVectorEnv(BatchedEnv):
-    """The double integrator and Van der Pol families, and problems of a user's own: N copies of a `Problem`.
+    """N copies of a `Problem`: the double integrator and Van der Pol families, and problems of a user's own.
 
-    Observation: the paper's o_t = [x1, x2, x1_target, x2_target, tau, phi] with several phases, [x1, x2, tau] with one
-    (ours); tau = t / T, phi the 0-based phase over (phases - 1). The target that is seen moves to a new waypoint over
-    the first `TRANSITION_STEPS` of its phase. Action: u, clipped to the set of controls. A vector whose norm is bounded
-    from below keeps its direction, and a zero vector points along the last axis.
+    Observation: with several phases the paper's o_t = [x1, x2, x1_target, x2_target, tau, phi], with one phase
+    [x1, x2, tau], which is our choice. tau = t / T, and phi is the 0-based phase over (phases - 1). The observed target
+    moves to a new waypoint over the first `TRANSITION_STEPS` of its phase.
 
-    Reward: the paper's r_t, -(dx'Q dx + R u^2) with dx the distance to the phase's target before the step; a phase's
-    last step adds -Qf |dx|^2 + B 1[|dx| <= r] after it, so that an episode's rewards sum to bonus - J. The paper prints
-    r_t for one phase and target 0; that each phase has its own is ours, and so are a table's functions and bounds
-    (`Problem`). The end of the horizon is `terminated` (time is observed).
+    Action: u, clipped to the set of controls. A vector whose norm has a lower bound keeps its direction. A zero vector
+    then points along the last axis.
 
-    A step in which a phase ends by its event ends there, too, and weights count in proportion to its length. The next
-    phase begins at that moment. With events tau is the time over the longest one.
+    Reward: the paper's r_t = -(dx'Q dx + R u^2), where dx is the distance to the phase's target before the step. A
+    phase's last step adds -Qf |dx|^2 + B 1[|dx| <= r] with dx after the step. So an episode's rewards sum to bonus - J.
+    The paper prints r_t for one phase and target 0. A reward for each phase is our extension, and so are the functions
+    and bounds of a table (`Problem`). The end of the horizon is `terminated`, because the time is observed.
 
-    `final_info`: `episodic_return` (with the true radii), `cost`, its parts `cost_state`, `cost_control`,
-    `cost_terminal` (or those of `Problem.parts`), each (N,), and `hit` and `terminal_error` (the distance to the target
-    at each phase's end, in radii where the circle is an ellipse), each (N, phases); with events `final_time` (N,) s,
-    with scores `draw` (N, k).
+    If a phase ends by its event, the step ends at that moment, and its weights count in proportion to its length. The
+    next phase begins at the same moment. With events tau is the time over the longest possible one.
 
-    `observe_phase=False` shows tau and phi as 0, `observe_velocity=False` the velocities. `observe_draw` shows the
-    standard scores behind them, `observe_command` the action of the step before (0 at first). With `scaled_action` an
-    action of 0 is the middle of the set of controls, and one of 1 is `Problem.u_unit` more: our scripts use it.
+    `final_info`:
 
-    `reset(options={"x0": (N, n)})` sets the starts, `{"draw": (N, k)}` the scores.
+    - `episodic_return` (N,), with the true radii
+    - `cost` (N,) and its parts `cost_state`, `cost_control`, `cost_terminal` (N,), or those of `Problem.parts`
+    - `hit` and `terminal_error` (N, phases): the distance to the target at each phase's end, in radii for an ellipse
+    - with events `final_time` (N,) in s
+    - with scores `draw` (N, k)
 
-    Attributes that only training changes, to be set before a `reset`: `radius_scale`, a scalar or one number a phase,
-    enlarges the radii in which the *reward* pays the bonus (1 is the paper); `bonus_width`, the distance beyond them
-    over which that bonus falls to 0 linearly (0, a step, is the paper); and `flights_per_start` (`BatchedEnv`).
+    `observe_phase=False` shows tau and phi as 0, and `observe_velocity=False` the velocities. `observe_draw` adds the
+    standard scores to the observation, and `observe_command` the last action (0 at first). With `scaled_action`, which
+    our scripts use, an action of 0 is the middle of the set of controls, and an action of 1 is `Problem.u_unit` more.
+
+    `reset(options={"x0": x})` sets the starts x (N, n), and `{"draw": z}` the scores z (N, k). Raises BadInput for
+    anything else.
+
+    Only training changes these attributes, before a `reset`:
+
+    - `radius_scale`: a factor on the radii in which the reward pays the bonus, one number or one a phase (paper: 1)
+    - `bonus_width`: the distance beyond the radii over which this bonus falls linearly to 0 (paper: 0, a step)
+    - `flights_per_start` (`BatchedEnv`)
     """
 
     metadata = {**BatchedEnv.metadata, **RENDERED}
@@ -65,8 +74,12 @@ class PhasedVectorEnv(BatchedEnv):
         render_mode: str | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
     ):
-        self.problem, self.observe_phase, self.observe_velocity = problem, observe_phase, observe_velocity
-        self.observe_draw, self.observe_command, self.scaled_action = observe_draw, observe_command, scaled_action
+        self.problem = problem
+        self.observe_phase = observe_phase
+        self.observe_velocity = observe_velocity
+        self.observe_draw = observe_draw
+        self.observe_command = observe_command
+        self.scaled_action = scaled_action
         allowed = "needs `velocities` in the table, the states that it hides"
         refuse_unless(observe_velocity or problem.hidden_velocities, "observe_velocity", observe_velocity, allowed)
         allowed = "needs `scores` in the table, which it shows"
@@ -80,7 +93,7 @@ class PhasedVectorEnv(BatchedEnv):
         self.observation_scale = self._scale_of_observations()
         self.has_circles = problem.circles_count
         self.x = tuple(np.zeros(num_envs) for _ in range(problem.states))
-        # the control of the step before, as applied: (N,), or (N, m) where the table has a tuple of them
+        # the last applied control: (N,), or (N, m) if the table has a tuple of controls
         self.u = np.zeros((num_envs, problem.controls) if isinstance(problem.u_max, tuple) else num_envs)
         self.time = np.zeros(num_envs)  # s
         self.draw = np.zeros((num_envs, problem.scores))
@@ -93,14 +106,14 @@ class PhasedVectorEnv(BatchedEnv):
         self._terminal_error = np.zeros((num_envs, len(problem.phases)))
 
     def _observation_box(self, action_box):
-        """Least and greatest observation."""
+        """The least and the greatest observation."""
         problem = self.problem
         high = [*problem.x_max]
         low = [-bound for bound in high]
         if problem.waypoints:
             for component in zip(*map(problem.targets_of, problem.phases)):
                 largest = max(abs(target or 0.0) for target in component)
-                high.append(largest or 1.0)  # all at rest: a box must have a width
+                high.append(largest or 1.0)  # a box must have a width, even if all targets are 0
                 low.append(-high[-1])
         clocks = 2 if problem.waypoints else 1
         high += [1.0] * clocks
@@ -115,7 +128,7 @@ class PhasedVectorEnv(BatchedEnv):
         return np.array(low), np.array(high)
 
     def _scale_of_observations(self):
-        """A usual size of each observation: the table's for states and targets, 1 for the rest."""
+        """A usual size of each observation: the table's for states and targets, and 1 for the rest."""
         scale = np.ones(self.single_observation_space.shape)
         n = self.problem.states
         scale[:n] = self.problem.scale
@@ -130,12 +143,13 @@ class PhasedVectorEnv(BatchedEnv):
 
     @property
     def phase(self) -> np.ndarray:
-        """The 0-based phase (N,) of the running steps; after the last step the last one."""
+        """The 0-based phase (N,) of the running steps. After the last step it is the last phase."""
         return np.minimum(self._phase, len(self.problem.phases) - 1)
 
     def _tabulate(self):
-        """The tables by phase: `_phase` picks a row."""
-        problem, phases = self.problem, self.problem.phases
+        """Make the tables by phase, of which `_phase` picks a row."""
+        problem = self.problem
+        phases = problem.phases
         self._steps = np.array([phase.steps for phase in phases])
         targets = [[target or 0.0 for target in problem.targets_of(phase)] for phase in phases]
         self._target = np.array(targets)  # (phases, n)
@@ -145,12 +159,12 @@ class PhasedVectorEnv(BatchedEnv):
         self._limits = problem.limits[:, :, None]
         self._hidden = () if self.observe_velocity else problem.hidden_velocities
         self._has_events = problem.has_events
-        # by phase and step in it, up to TRANSITION_STEPS: the target that is seen
+        # the observed target by phase and step in the phase, up to TRANSITION_STEPS
         blend = np.minimum(np.arange(TRANSITION_STEPS + 1) / TRANSITION_STEPS, 1.0)[:, None]
         before = self._target[[max(k - 1, 0) for k in range(len(phases))]]
         self._seen_target = np.stack([(1 - blend) * old + blend * new for old, new in zip(before, self._target)])
         self._moves = [(k, phase) for k, phase in enumerate(phases) if phase.end is not None]
-        self._alike = len({(phase.f, phase.running) for phase in phases}) == 1  # one dynamics for all
+        self._alike = len({(phase.f, phase.running) for phase in phases}) == 1  # all phases have the same dynamics
 
     def _start(self, mask, options):
         self._refuse_options(options)
@@ -169,22 +183,24 @@ class PhasedVectorEnv(BatchedEnv):
         for component, start in zip(self.x, x0.T):
             component[mask] = start
         self.draw[mask] = draw
-        for mine, new in zip(self._parameters, problem.hidden(draw)):
-            mine[mask] = new
+        for parameter, drawn in zip(self._parameters, problem.hidden(draw)):
+            parameter[mask] = drawn
         for part in self._costs.values():
             part[mask] = 0.0
-        self.time[mask] = self._bonus[mask] = self._command[mask] = self._terminal_error[mask] = 0.0
-        self._phase[mask] = self._step_in_phase[mask] = 0
+        for array in (self.time, self._bonus, self._command, self._terminal_error):
+            array[mask] = 0.0
+        self._phase[mask] = 0
+        self._step_in_phase[mask] = 0
 
     def _refuse_options(self, options):
-        """BadInput for an option of `reset` that this table does not have."""
+        """Raise BadInput for an option of `reset` that this table does not have."""
         known = ["x0", "draw"] if self.problem.scores else ["x0"]
         if options.keys() - set(known):
             allowed = "the only one is 'x0'" if len(known) == 1 else "they may be 'x0' and 'draw'"
             raise BadInput(f"reset options are {options!r}; {allowed}")
 
     def _checked(self, name, given, width):
-        """An option of `reset` as an array (N, width); BadInput where it is none."""
+        """An option of `reset` as an array (N, width). Raises BadInput for anything else."""
         try:
             rows = np.asarray(given, dtype=np.float64)
         except (TypeError, ValueError):
@@ -195,7 +211,8 @@ class PhasedVectorEnv(BatchedEnv):
 
     def _observe(self):
         """The paper's o_t of the running steps."""
-        problem, phase = self.problem, self.phase
+        problem = self.problem
+        phase = self.phase
         columns = [x * 0.0 if k in self._hidden else x for k, x in enumerate(self.x)]
         if problem.waypoints:
             running = np.where(self._phase == phase, self._step_in_phase, TRANSITION_STEPS)
@@ -231,7 +248,7 @@ class PhasedVectorEnv(BatchedEnv):
         self.x, running = self._fly(before, controls, phase, problem.dt)
         running = np.zeros(self.num_envs) + running  # a table's `running` may be one number for all
         if self._has_events:
-            has_ended = self._phase >= len(problem.phases)  # in an earlier step, and not reset: it stays where it is
+            has_ended = self._phase >= len(problem.phases)  # ended in an earlier step and not reset, so it stays
             self.x = tuple(np.where(has_ended, x, after) for x, after in zip(before, self.x))
         ends = self._step_in_phase + 1 == self._steps[phase]
         for k, event in self._moves:
@@ -243,14 +260,15 @@ class PhasedVectorEnv(BatchedEnv):
         rewards = -sum(costs.values(), np.zeros(self.num_envs))
         self.u = u.T.copy() if isinstance(problem.u_max, tuple) else u[0]
         self._command = (u.T - self._centre) / self._unit if self.scaled_action else u.T.copy()
-        self.t, self.time = self.t + 1, self.time + length
+        self.t = self.t + 1
+        self.time = self.time + length
         self._step_in_phase += 1
         if ends.any():
             rewards += self._end_phase(np.flatnonzero(ends))
         return rewards, self._phase >= len(problem.phases), self._final_info
 
     def _fly(self, x, u, phase, h):
-        """The states h seconds later, and the integral of `running` over them: of each environment by its phase."""
+        """The states h seconds later, and the integral of `running` over them, by the phase of each environment."""
         problem, phases = self.problem, self.problem.phases
         if self._alike or (phase == phase[0]).all():
             return problem.step(phases[phase[0]], x, u, self._parameters, h)
@@ -261,18 +279,19 @@ class PhasedVectorEnv(BatchedEnv):
         return tuple(after), cost
 
     def _fly_some(self, there, phase: Phase, x, u, h):
-        """As `Problem.step`, for the environments in the mask or of the indices `there`."""
+        """`Problem.step` for the environments `there`, a mask or indices."""
         some = lambda values: tuple(value[there] for value in values)  # noqa: E731
         u = some(u) if isinstance(u, tuple) else u[there]
         return self.problem.step(phase, some(x), u, some(self._parameters), h)
 
     def _end_by_event(self, k, phase: Phase, before, u, running, length):
-        """The environments (N,) in phase k whose event falls through 0 in this step; puts them where it does."""
-        problem, p = self.problem, self._parameters
-        event = problem.with_parameters(phase.end, p)
-        begin, end = np.zeros(self.num_envs) + event(before), np.zeros(self.num_envs) + event(self.x)
+        """The environments (N,) in phase k whose event falls through 0 in this step. Puts them where it does."""
+        problem = self.problem
+        event = problem.with_parameters(phase.end, self._parameters)
+        begin = np.zeros(self.num_envs) + event(before)
+        end = np.zeros(self.num_envs) + event(self.x)
         falls = (self._phase == k) & (begin > 0)
-        until = np.full(self.num_envs, problem.dt)  # s, where it is below 0
+        until = np.full(self.num_envs, problem.dt)  # s, a time when the event is below 0
         dips = np.flatnonzero(falls & (end > 0))
         if len(dips):
             lowest, value = self._dip(dips, phase, before, u, begin[dips], end[dips])
@@ -290,7 +309,7 @@ class PhasedVectorEnv(BatchedEnv):
         return met
 
     def _view(self, there, phase: Phase, before, u):
-        """Of the environments `there`: dynamics f(x), states at a step's begin, event(x), and fly(h), as `step`."""
+        """For the environments `there`: dynamics f(x), states at the step's begin, event(x), and fly(h) as `step`."""
         problem = self.problem
         x, p = (tuple(value[there] for value in values) for values in (before, self._parameters))
         u = tuple(value[there] for value in u) if isinstance(u, tuple) else u[there]
@@ -299,21 +318,24 @@ class PhasedVectorEnv(BatchedEnv):
         return lambda x: f(x, u), x, event, lambda h: problem.step(phase, x, u, p, h)
 
     def _dip(self, there, phase: Phase, before, u, begin, end):
-        """When in this step the event is least, (n,) s, and its value there, of environments where both ends are above.
+        """The times (n,) in s at which the event is least in this step, and its values there.
 
-        A soft touchdown is such a dip: held for the rest of the step, its thrust would lift off again. The least value
-        is that of the cubic through both ends with the event's slopes; it is evaluated only where the event falls at
-        the begin and rises at the end.
+        The event is above 0 at both ends of the step. A soft touchdown is such a dip: its thrust, held for the rest of
+        the step, would lift off again. The time is that of the least value of the cubic through both ends with the
+        event's slopes. It is looked for only if the event falls at the begin and rises at the end.
         """
         dt = self.problem.dt
         f, x, event, fly = self._view(there, phase, before, u)
         after = tuple(component[there] for component in self.x)
         slope, slope_after = (dt * slope_along(event, y, f(y)) for y in (x, after))
         turns = np.flatnonzero((slope < 0) & (slope_after > 0))
-        lowest, value = np.full(len(there), dt), end.copy()
+        lowest = np.full(len(there), dt)
+        value = end.copy()
         if len(turns):
-            m0, m1, g0, g1 = slope[turns], slope_after[turns], begin[turns], end[turns]
-            a, b = 6 * (g0 - g1) + 3 * (m0 + m1), 6 * (g1 - g0) - 4 * m0 - 2 * m1
+            m0, m1 = slope[turns], slope_after[turns]
+            g0, g1 = begin[turns], end[turns]
+            a = 6 * (g0 - g1) + 3 * (m0 + m1)
+            b = 6 * (g1 - g0) - 4 * m0 - 2 * m1
             share = -2 * m0 / (b + np.sqrt(b * b - 4 * a * m0))
             lowest[turns] = dt * np.clip(share, 0.0, 1.0)
             _, _, event, fly = self._view(there[turns], phase, before, u)
@@ -338,7 +360,7 @@ class PhasedVectorEnv(BatchedEnv):
         return costs
 
     def _end_phase(self, ending):
-        """Terminal cost and bonus of the environments `ending`, whose phase ends here; returns their reward, (N,)."""
+        """Add the terminal cost and bonus of the environments `ending`, whose phase ends. Returns their reward (N,)."""
         rewards = np.zeros(self.num_envs)
         phases = self.problem.phases
         of_phase = self.phase[ending]
@@ -375,16 +397,16 @@ class PhasedVectorEnv(BatchedEnv):
         return self.time.copy(), controls, np.column_stack(self.x)
 
     def _make_sheet(self):
-        # Matplotlib takes a quarter of a second that only a picture should cost
+        # only a picture should wait the quarter of a second that Matplotlib takes to load
         from phased.animation import sheet_of
 
         return sheet_of(self.problem)
 
 
 def end_of_phase(problem: Problem, phase: Phase, x, p):
-    """Terminal cost (n,), distance to the target (n,) and the radius that it must not exceed, of states x at the end.
+    """Terminal cost (n,), distance to the target (n,), and the radius that it must not exceed, for states x at the end.
 
-    The distance is in radii where each state has its own.
+    The distance is in radii if each state has its own radius.
     """
     d = problem.distances(phase, x)
     distance = np.hypot.reduce(np.array(d), axis=0) if d else np.zeros_like(x[0])
@@ -395,27 +417,27 @@ def end_of_phase(problem: Problem, phase: Phase, x, p):
 
 
 def slope_along(event: Callable, x, dx) -> np.ndarray:
-    """The change of event(x) for each second along the derivatives dx, by a difference."""
+    """The change of event(x) in a second along the derivatives dx, by a difference quotient."""
     small = 1e-6
     ahead = event(tuple(xi + small * di for xi, di in zip(x, dx)))
     return (ahead - event(x)) / small
 
 
 class PhasedEnv(SingleEnv):
-    """One `PhasedVectorEnv`."""
+    """One flight of `PhasedVectorEnv`."""
 
     radius_scale = of_batch("radius_scale", "Factor on the radii in which the reward pays the bonus (1: the paper).")
     bonus_width = of_batch("bonus_width", "Distance beyond them over which the bonus falls to 0 (0: the paper).")
 
 
 def make_phased_vector(env_id: str, num_envs: int = 1, **options) -> PhasedVectorEnv:
-    """The batched environment of a problem in `PROBLEMS`; what `gymnasium.make_vec` calls."""
+    """The batched environment of a problem in `PROBLEMS`. `gymnasium.make_vec` calls it."""
     check_options(PhasedVectorEnv, options)
     return PhasedVectorEnv(PROBLEMS[env_id], num_envs, **options).sealed()
 
 
 def make_phased(env_id: str, **options) -> PhasedEnv:
-    """The single environment of a problem in `PROBLEMS`; what `gymnasium.make` calls."""
+    """The single environment of a problem in `PROBLEMS`. `gymnasium.make` calls it."""
     refuse_autoreset(options)
     return PhasedEnv(make_phased_vector(env_id, **options)).sealed()
 
@@ -423,7 +445,7 @@ def make_phased(env_id: str, **options) -> PhasedEnv:
 def register_problem(problem: Problem):
     """Make a table known to `gymnasium.make`, to the scripts and to `baselines.py`, under its `env_id`.
 
-    Raises BadInput where the id is taken.
+    Raises BadInput if the id is taken.
     """
     taken = problem.env_id in PROBLEMS or problem.env_id in gym.registry
     refuse_unless(not taken, "env_id", repr(problem.env_id), "is taken already; it must be an id of its own")
@@ -437,22 +459,23 @@ def register_problem(problem: Problem):
 
 
 def fly(env_id: str, policy: Callable, x0, draw=None, **options) -> dict:
-    """Fly `policy(obs (n, obs), t) -> action (n, m)` from each start x0 (n, states) and record what happened.
+    """Fly `policy(obs (n, obs), t) -> action (n, m)` from each start x0 (n, states), and record the flights.
 
-    draw (n, k) are the standard scores of a table with some. Returns x (n, T+1, states), the applied (clipped) u
-    (n, T), or (n, T, m) where the table has a tuple of controls, reward (n, T), and the arrays of `final_info`. Behind
-    an episode's end x and u are NaN, and rewards 0.
+    draw (n, k) are the standard scores, if the table has any. Returns x (n, T+1, states), the applied (clipped) u
+    (n, T), or (n, T, m) if the table has a tuple of controls, reward (n, T), and the arrays of `final_info`. After an
+    episode's end x and u are NaN, and rewards are 0.
     """
     batch: Any = gym.make_vec(env_id, num_envs=len(x0), **options)  # a PhasedVectorEnv
     problem = batch.problem
     n, T = len(x0), problem.steps
     x = np.full((n, T + 1, problem.states), np.nan)
-    u, reward = np.full((T, *batch.u.shape), np.nan), np.zeros((n, T))
+    u = np.full((T, *batch.u.shape), np.nan)
+    reward = np.zeros((n, T))
     final_info = {}
     alive = np.ones(n, dtype=bool)
     has_draw = problem.scores and draw is not None
     obs, _ = batch.reset(options={"x0": x0, "draw": draw} if has_draw else {"x0": x0})
-    x[:, 0] = np.column_stack(batch.x)  # not of obs: the velocity may be hidden there
+    x[:, 0] = np.column_stack(batch.x)  # not from obs, where the velocity may be hidden
     for t in range(T):
         obs, rewards, ended, final = batch.advance(policy(obs, t))
         x[alive, t + 1] = np.column_stack(batch.x)[alive]
@@ -466,4 +489,4 @@ def fly(env_id: str, policy: Callable, x0, draw=None, **options) -> dict:
     return {"x": x, "u": np.moveaxis(u, 0, 1), "reward": reward, **final_info}
 
 
-make_phased.metadata = RENDERED  # where gym.make looks before there is an environment
+make_phased.metadata = RENDERED  # gym.make looks here before there is an environment

@@ -1,4 +1,4 @@
-"""What is taken along of a small problem's flights: names of a policy's numbers, columns of a table."""
+"""A small problem's policy and flights for other tools: names of a policy's numbers, columns of tables."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def interface(
     observe_command: bool = False,
     scaled_action: bool = False,
 ) -> Interface:
-    """What a policy on these options of the environment observes and commands."""
+    """What a policy observes and commands, with these options of the environment."""
     states, controls = state_names(problem), control_names(problem)
     clocks = ["tau", "phi"] if problem.waypoints else ["tau"]
     seen = list(states)
@@ -57,7 +57,7 @@ def interface(
 
 
 def step_columns(problem: Problem, arrays: dict) -> dict[str, np.ndarray]:
-    """The flights below one another, a row each state: time (s), state, and the control from there on."""
+    """The columns of all flights, a row for each state: time (s), state, and the control from there on."""
     x = arrays["x"]
     u = arrays["u"].reshape(*arrays["u"].shape[:2], problem.controls)
     times = np.tile(arrays["t"], (len(x), 1))
@@ -69,7 +69,7 @@ def step_columns(problem: Problem, arrays: dict) -> dict[str, np.ndarray]:
 
 
 def flight_columns(problem: Problem, arrays: dict) -> dict[str, np.ndarray]:
-    """A row for each flight: start, end, cost, and the optimum's cost from the same start."""
+    """The columns with a row for each flight: start, end, cost, and the optimum's cost from the same start."""
     x = arrays["x"]
     last = np.isfinite(x).all(axis=2).sum(axis=1) - 1
     names = state_names(problem)

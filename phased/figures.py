@@ -30,7 +30,7 @@ def trajectories_figure(problem: Problem, arrays: dict, title: str) -> Figure:
             plane.plot(x[:, 0], x[:, 1], **style)
             position.plot(t, x[:, 0], **style)
             velocity.plot(t, x[:, 1], **style)
-            control.stairs(u, t, baseline=None, **style)  # held over each step
+            control.stairs(u, t, baseline=None, **style)  # a control is held over each step
     plane.plot(*arrays["x"][:SHOWN, 0].T, "k.")
     mark_targets(problem, plane, position, velocity)
     for end in problem.phase_ends[:-1]:
@@ -96,7 +96,7 @@ def flights_of(problem: Problem, arrays: dict, suffix: str) -> list[Flight]:
 
 
 def mark_table(problem: Problem, panels):
-    """Targets and bounds of each state, the set of controls, and the ends of phases of fixed time."""
+    """Mark targets and bounds of each state, the set of controls, and the ends of phases of fixed time."""
     start = 0.0
     for phase in problem.phases:
         end = start + phase.steps * problem.dt
@@ -113,14 +113,14 @@ def mark_table(problem: Problem, panels):
 
 
 def mark_limits(ax, limits):
-    """Dashed lines at the finite ones of two bounds."""
+    """Draw dashed lines at those of two bounds that are finite."""
     for limit in limits:
         if np.isfinite(limit):
             ax.axhline(limit, **{**BOUNDARY, "linestyle": "--"})
 
 
 def mark_targets(problem: Problem, plane, position, velocity):
-    """Green: each phase's target circle in the phase plane, and its target as a dashed line over the phase's time."""
+    """Draw in green each phase's target circle in the phase plane, and its target as a dashed line over time."""
     start = 0.0
     for k, phase in enumerate(problem.phases, start=1):
         add_circle(problem, phase, plane)
@@ -135,7 +135,7 @@ def mark_targets(problem: Problem, plane, position, velocity):
 
 
 def add_circle(problem: Problem, phase: Phase, plane, zorder: int = 3):
-    """A phase's circle (or ellipse) in the phase plane: the patch; None where there is none, or a state is free."""
+    """The patch of a phase's circle or ellipse in the phase plane. None without one, or if a state is free."""
     target = problem.targets_of(phase)
     if not phase.has_circle or None in target:
         return None
@@ -161,7 +161,7 @@ def add_legend(figure: Figure, problem: Problem):
 
 
 def costs_figure(problem: Problem, arrays: dict, title: str) -> Figure:
-    """Total costs of all starts as a histogram; of the first ten their total with the ratio, and its three parts."""
+    """A histogram of all starts' total costs, and for the first ten the total with the ratio and its three parts."""
     has_parts = problem.weighted and not problem.has_events  # others are told in eval.json alone
     rows = [["all", "total", "total"], *([["state", "control", "terminal"]] if has_parts else [])]
     figure = Figure(figsize=(12, 3.5 * len(rows)), layout="constrained")
@@ -198,11 +198,11 @@ def plot_bars(ax, ours: np.ndarray, optimum: np.ndarray, label: str):
     ax.grid(axis="y", alpha=0.3)
 
 
-SMALLEST_LOSS = 1e-6  # a smaller one is shown as this: the optimum itself is known to about 1e-8
+SMALLEST_LOSS = 1e-6  # a smaller loss is shown as this, because the optimum itself is known to about 1e-8
 
 
 def cost_error_figure(problem: Problem, arrays: dict, title: str) -> Figure:
-    """Where the policy is least optimal: J - J* over the box of the starts, and over |x0| beside J* itself.
+    """The loss J - J* of the policy over the box of the starts, and over |x0| beside J* itself.
 
     Near the origin J* falls with |x0|^2 and the loss need not: such starts have the large ratios J / J*.
     """

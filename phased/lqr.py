@@ -1,4 +1,4 @@
-"""Linear-quadratic optimum of costs by weights: the finite-horizon discrete LQR about the targets."""
+"""The linear-quadratic optimum for costs by weights: the finite-horizon discrete LQR about the targets."""
 
 from __future__ import annotations
 
@@ -10,12 +10,11 @@ from phased.problem import Phase, Problem
 
 
 def linearise(problem: Problem, point=None, phase: Phase | None = None):
-    """A (n, n) and B (n, m) of x_{k+1} = A x_k + B u_k + const. about a point (the origin), for the environment's step.
+    """A (n, n) and B (n, m) of x_{k+1} = A x_k + B u_k + const. for the environment's step.
 
-    The dynamics are those of a phase, the first unless given.
-
-    Central differences of fourth order, with a step that is a power of two: for a linear problem they are exact but for
-    rounding, and dynamics need not be analytic, as those with np.abs or np.interp are not.
+    They are taken about a point, by default the origin, with the dynamics of a phase, by default the first. They are
+    central differences of fourth order, with a step that is a power of two. For a linear problem these are exact up to
+    rounding. They also suit dynamics that are not analytic, such as those with np.abs or np.interp.
     """
     n, m = problem.states, problem.controls
     point = np.zeros(n) if point is None else np.asarray(point, dtype=float)
@@ -32,15 +31,19 @@ def linearise(problem: Problem, point=None, phase: Phase | None = None):
 def riccati(problem: Problem):
     """Finite-horizon discrete LQR by the backward Riccati recursion (e.g. Anderson and Moore, Optimal Control, 1990).
 
-    The dynamics are linearised about each phase's target x*, which need not be at rest: with d = x - x* the control is
-    u_t = -K_t d_t - k_t and the cost to go d'P_t d + 2 p_t'd + const. A state without a target has no weight, and 0 in
-    place of it. Returns K (T, m, n), k (T, m) and P (T+1, n, n). Raises ValueError where costs are not by weights.
+    The dynamics are linearised about each phase's target x*, which need not be at rest. With d = x - x* the control is
+    u_t = -K_t d_t - k_t, and the cost to go is d'P_t d + 2 p_t'd + const. A state without a target has no weight and
+    the target 0. Returns K (T, m, n), k (T, m) and P (T+1, n, n). Raises ValueError if costs are not by weights.
     """
     if not problem.weighted or problem.has_events:
         raise ValueError(f"{problem.env_id} has costs by functions, or events; LQR is for weights and fixed times")
     n, m, T = problem.states, problem.controls, problem.steps
-    K, k, P, p = np.empty((T, m, n)), np.empty((T, m)), np.zeros((T + 1, n, n)), np.zeros(n)
-    end, next_target = T, point_of(problem, problem.phases[-1])
+    K = np.empty((T, m, n))
+    k = np.empty((T, m))
+    P = np.zeros((T + 1, n, n))
+    p = np.zeros(n)
+    end = T
+    next_target = point_of(problem, problem.phases[-1])
     for phase in reversed(problem.phases):
         target = point_of(problem, phase)
         A, B = linearise(problem, target, phase)
@@ -52,12 +55,14 @@ def riccati(problem: Problem):
         P[end] += phase.Qf * np.diag(np.array(aimed, dtype=float))
         R = np.diag(problem.control_weights(phase))
         for t in reversed(range(end - phase.steps, end)):
-            weight, ahead = R + B.T @ P[t + 1] @ B, P[t + 1] @ drift + p
+            weight = R + B.T @ P[t + 1] @ B
+            ahead = P[t + 1] @ drift + p
             K[t] = np.linalg.solve(weight, B.T @ P[t + 1] @ A)
             k[t] = np.linalg.solve(weight, B.T @ ahead)
             P[t] = np.diag(problem.state_weights(phase)) + A.T @ P[t + 1] @ (A - B @ K[t])
             p = (A - B @ K[t]).T @ ahead
-        end, next_target = end - phase.steps, target
+        end -= phase.steps
+        next_target = target
     return K, k, P
 
 
@@ -67,10 +72,10 @@ def point_of(problem: Problem, phase: Phase) -> np.ndarray:
 
 
 def lqr(problem: Problem):
-    """The gains K (T, n) of u_t = -K_t x_t and P (T+1, n, n) with the cost to go x'P_t x, by `riccati`; of one control.
+    """The gains K (T, n) of u_t = -K_t x_t, and P (T+1, n, n) of the cost to go x'P_t x, for problems with one control.
 
-    Exact for the double integrator without its bound; for Van der Pol the linearisation about the origin. Raises
-    ValueError on waypoints.
+    They are exact for the double integrator without its bound. For Van der Pol they are those of the linearisation
+    about the origin. Raises ValueError for waypoints.
     """
     if problem.waypoints:
         raise ValueError(f"{problem.env_id} has {len(problem.phases)} phases; LQR is for problems with 1")
@@ -85,7 +90,7 @@ def targets(problem: Problem) -> np.ndarray:
 
 
 def lqr_policy(problem: Problem) -> Callable:
-    """LQR about the targets, clipped at the control bounds, as a policy for `envs.fly`."""
+    """The policy for `envs.fly` of LQR about the targets, clipped at the control bounds."""
     K, k, _ = riccati(problem)
     target, (low, high) = targets(problem), problem.u_box
     n = problem.states

@@ -1,6 +1,6 @@
-"""A small problem's policy against the optimum: costs, ratios and shares of hits. Costs are the paper's J: plain sums.
+"""A small problem's policy against the optimum: costs, ratios and shares of hits. Costs are the paper's J, plain sums.
 
-The names of all metrics (eval.json) and arrays (eval.npz) are the interface of the project.
+The names of all metrics (eval.json) and arrays (eval.npz) are the project's interface.
 """
 
 from __future__ import annotations
@@ -9,12 +9,12 @@ import numpy as np
 
 from phased.problem import Problem
 
-PAPER_STARTS, PAPER_DRAWS = 10, 100  # the paper reports the mean ratio of ten starts; we draw such tens a hundred times
-NEAR_ORIGIN = 0.2  # |x0| within which J* is so small that the ratio says little and the loss J - J* says more
+PAPER_STARTS, PAPER_DRAWS = 10, 100  # the paper reports the mean ratio of ten starts; we draw ten starts 100 times
+NEAR_ORIGIN = 0.2  # for smaller |x0|, J* is so small that the loss J - J* says more than the ratio
 
 
 def flight_metrics(problem: Problem, flight: dict, reference: dict) -> dict:
-    """Means over all starts of what was flown and of the optimum, and the shares of starts that hit their circles."""
+    """Means over all starts for the policy and the optimum, and the shares of starts that hit their circles."""
     metrics = {}
     parts = ("cost", *(f"cost_{part}" for part in problem.parts))
     for prefix, result in (("", flight), ("reference_", reference)):
@@ -31,15 +31,15 @@ def flight_metrics(problem: Problem, flight: dict, reference: dict) -> dict:
 
 
 def hits_every_circle(problem: Problem, x: np.ndarray) -> np.ndarray:
-    """Whether flights x (n, T+1, states) are in the target's circle at the end of every phase; (n,) bool.
+    """Whether flights x (n, T+1, states) are in the target's circle at the end of every phase, (n,) bool.
 
-    Of a problem with events only for one phase, whose end is the last state that is finite.
+    With events the problem must have one phase, which ends at the last finite state.
     """
     hits = np.ones(len(x), dtype=bool)
     last = np.isfinite(x).all(axis=2).sum(axis=1) - 1
     for phase, end in zip(problem.phases, problem.phase_ends):
         step = last if problem.has_events else np.full(len(x), end)
-        # in the environment's words: the optimum is on the circle's edge, where another rounding would decide otherwise
+        # computed as in the environment, because the optimum is on the circle's edge, where rounding decides
         state = tuple(x[np.arange(len(x)), step].T)
         error = problem.circle_distance(phase, state)
         hits &= error <= phase.circle_radius
@@ -47,10 +47,10 @@ def hits_every_circle(problem: Problem, x: np.ndarray) -> np.ndarray:
 
 
 def comparable(problem: Problem, x: np.ndarray, x_reference: np.ndarray) -> np.ndarray:
-    """The starts (n,) whose costs may be compared: all, or where circles count those where both sides hit them all.
+    """The starts (n,) whose costs may be compared: all, or if circles count, those from which both sides hit them all.
 
-    Skipping a circle is cheaper than hitting it, so that a miss would count as better than the optimum. An optimum that
-    hits every circle is the radius-constrained one, also where the constraint did not have to be imposed.
+    Skipping a circle is cheaper than hitting it, so a miss would count as better than the optimum. An optimum that hits
+    every circle is the radius-constrained optimum, even if the constraint did not have to be imposed.
     """
     if not problem.circles_count:
         return np.ones(len(x), dtype=bool)
@@ -58,11 +58,11 @@ def comparable(problem: Problem, x: np.ndarray, x_reference: np.ndarray) -> np.n
 
 
 def ratio_metrics(cost: np.ndarray, reference_cost: np.ndarray, eval_seed: int) -> dict:
-    """Statistics of the cost ratios ours / optimum of the comparable starts, both (m,); without a start, no key.
+    """Statistics of the cost ratios, policy over optimum, of the m comparable starts. Without a start there is no key.
 
-    The paper's number is the mean of ten ratios: `ratio_mean` is its expectation, the draws of ten are its spread.
-    Where the optimum's cost is below 0 (a gain) the ratio is 1 + loss / |gain|: above 1 is worse, as everywhere. A
-    start whose optimum costs nothing has none.
+    The paper's number is the mean of ten ratios. `ratio_mean` is its expectation, and the draws of ten show its spread.
+    If the optimum's cost is below 0 (a gain), the ratio is 1 + loss / |gain|, so that above 1 is worse, as everywhere.
+    A start whose optimum costs nothing has no ratio.
     """
     has_ratio = reference_cost != 0
     cost, reference_cost = cost[has_ratio], reference_cost[has_ratio]
@@ -73,7 +73,7 @@ def ratio_metrics(cost: np.ndarray, reference_cost: np.ndarray, eval_seed: int) 
     metrics |= {"ratio_median": np.median(ratio), "ratio_p95": np.percentile(ratio, 95)}
     metrics |= {"ratio_min": ratio.min(), "ratio_max": ratio.max()}
     if len(ratio) >= PAPER_STARTS:
-        rng = np.random.default_rng([eval_seed, 1])  # not the stream that drew the starts
+        rng = np.random.default_rng([eval_seed, 1])  # another stream than that of the starts
         means = [rng.choice(ratio, PAPER_STARTS, replace=False).mean() for _ in range(PAPER_DRAWS)]
         for percentile in (5, 50, 95):
             metrics[f"ten_start_ratio_mean_p{percentile:02d}"] = np.percentile(means, percentile)
@@ -81,21 +81,21 @@ def ratio_metrics(cost: np.ndarray, reference_cost: np.ndarray, eval_seed: int) 
 
 
 def cost_ratio(cost, reference_cost):
-    """cost / reference_cost, or where that is below 0 one plus the loss in units of the gain."""
+    """cost / reference_cost, or 1 + loss / |gain| if reference_cost is a gain, below 0."""
     return np.where(reference_cost > 0, cost / reference_cost, 1 + (cost - reference_cost) / np.abs(reference_cost))
 
 
 def ends_at_origin(problem: Problem) -> bool:
-    """Whether its only target is the origin of two states, where the optimal cost of a start vanishes."""
+    """Whether the only target is the origin of two states, where the optimal cost of a start vanishes."""
     (phase, *others) = problem.phases
     return problem.states == 2 and problem.weighted and not others and phase.target == (0.0, 0.0)
 
 
 def near_origin_metrics(problem: Problem, x0: np.ndarray, cost: np.ndarray, reference_cost: np.ndarray) -> dict:
-    """The mean loss J - J* of the starts x0 (m, 2) near the origin; without one, or with another target, no key.
+    """The mean loss J - J* of the starts x0 (m, 2) near the origin. With none, or another target, there is no key.
 
-    There J* vanishes with |x0|^2, so that a loss c makes a start's ratio 1 + c / J* as large as one likes, and a few
-    such starts make the mean ratio of all. With waypoints J* does not vanish: the second is not at the origin.
+    J* vanishes there with |x0|^2. So a loss c can make a start's ratio 1 + c / J* arbitrarily large, and a few such
+    starts dominate the mean ratio of all. With waypoints J* does not vanish, because the second is not at the origin.
     """
     if not ends_at_origin(problem):
         return {}

@@ -1,7 +1,7 @@
-"""The optimum of a table by IPOPT: states and held controls of every step are unknowns, the dynamics constraints.
+"""The optimum of a table by IPOPT. The unknowns are states and held controls of every step; dynamics are constraints.
 
-Reading order: meshes and transcriptions ("defects"), the program, guesses, solutions. `baselines.py` flies what is
-found here. CasADi is imported only where it is used.
+Reading order: meshes and transcriptions ("defects"), the program, guesses, solutions. `baselines.py` flies the
+solutions. CasADi is imported only where it is used.
 """
 
 from __future__ import annotations
@@ -19,15 +19,16 @@ from phased.environment import fly
 from phased.lqr import lqr_policy
 from phased.problem import PROBLEMS, Phase, Problem
 
-FIRST_STEPS = 40  # of a phase with an event, at most, until its length is known
-HELD_TRIES = 4  # other numbers of steps, once it is
+FIRST_STEPS = 40  # most steps of a phase with an event, while its length is unknown
+HELD_TRIES = 4  # other numbers of steps that are tried when its length is known
 
 
 class Mesh(NamedTuple):
     """The steps into which a program cuts each phase.
 
-    A phase of fixed time has steps of dt / `refine`. One that ends by an event has one length h as an unknown: of its
-    last step, behind steps of dt as the environment flies them, or with `stretched` of all its steps.
+    A phase of fixed time has steps of dt / `refine`. A phase that ends by an event has one unknown length h. It is the
+    length of the last step, after steps of dt as the environment flies them. With `stretched` it is the length of all
+    steps.
     """
 
     counts: tuple[int, ...]
@@ -36,29 +37,31 @@ class Mesh(NamedTuple):
 
     @classmethod
     def of(cls, problem: Problem) -> Mesh:
-        """That of a problem without events, or the first one with events, which finds out how long the phases are."""
-        counts = (phase.steps if phase.end is None else min(phase.steps, FIRST_STEPS) for phase in problem.phases)
+        """A problem's mesh without events, or its first one with events, which finds out how long the phases are."""
+        most = FIRST_STEPS
+        counts = [phase.steps if phase.end is None else min(phase.steps, most) for phase in problem.phases]
         return cls(tuple(counts), problem.has_events)
 
     def refined(self, factor: int) -> Mesh:
-        """One of shorter steps."""
+        """The mesh with steps that are `factor` times shorter."""
         return Mesh(tuple(count * factor for count in self.counts), True, factor)
 
 
 def shooting(problem: Problem, phase: Phase, x, u, p, h, x_next):
-    """Defect of multiple shooting, x_{k+1} - step(x_k, u_k), with the environment's own step; and the running cost."""
+    """Defect of multiple shooting, x_{k+1} - step(x_k, u_k) with the environment's step, and the running cost."""
     after, running = problem.step(phase, x, u, p, h)
     return tuple(b - a for a, b in zip(after, x_next)), running
 
 
 def hermite_simpson(problem: Problem, phase: Phase, x, u, p, h, x_next):
-    """Defect of direct collocation: a cubic through both ends that obeys x' = f(x, u) at mid-step, control held.
+    """Defect of direct collocation, and the running cost by Simpson's rule.
 
-    Hargraves and Paris (1987), in the compressed form of Betts, Practical Methods for Optimal Control, section 4.5; the
-    running cost by Simpson's rule.
+    A cubic through both ends of the step obeys x' = f(x, u) at mid-step, with a held control. Source: Hargraves and
+    Paris (1987), in the compressed form of Betts, Practical Methods for Optimal Control, section 4.5.
     """
     f = problem.with_parameters(phase.f or problem.f, p)
-    dx, dx_next = f(x, u), f(x_next, u)
+    dx = f(x, u)
+    dx_next = f(x_next, u)
     x_mid = tuple((a + b) / 2 + h / 8 * (da - db) for a, b, da, db in zip(x, x_next, dx, dx_next))
     dx_mid = f(x_mid, u)
     defects = tuple(b - a - h / 6 * (da + 4 * dm + db) for a, b, da, dm, db in zip(x, x_next, dx, dx_mid, dx_next))
@@ -71,21 +74,28 @@ def hermite_simpson(problem: Problem, phase: Phase, x, u, p, h, x_next):
 def program(problem: Problem, mesh: Mesh, defect: Callable, in_circles: bool):
     """The nonlinear program as CasADi symbols, and the bounds of its constraints: (symbols, lbg, ubg).
 
-    Unknowns: the controls u_0..u_{T-1}, m each, the states x_1..x_T, n each, and the lengths h of `Mesh`. Parameters:
-    x_0 and the hidden ones. Cost: J of `phased/environment.py` (the paper's "J", summed by us). Constraints: the
-    defects (n T of them, = 0); with `in_circles` the sum of (dx / r)^2 at each phase's end (<= 1); where a phase ends
-    by an event its value there (= 0) and before (>= 0); the square of a bounded norm.
+    - unknowns: the controls u_0..u_{T-1}, m each, the states x_1..x_T, n each, and the lengths h of `Mesh`
+    - parameters: x_0 and the hidden parameters
+    - cost: J of `phased/environment.py`, which is the paper's "J" as a sum over steps
+    - constraints: the defects (n T of them, = 0); with `in_circles` the sum of (dx / r)^2 at each phase's end (<= 1);
+      for a phase with an event its value at the end (= 0) and before (>= 0); the square of a bounded norm
     """
     import casadi as ca
 
-    ca.GlobalOptions.setNumpyMode(1)  # np.sin of a symbol is a symbol, without the warning that it was not always so
+    ca.GlobalOptions.setNumpyMode(1)  # np.sin of a symbol is a symbol; without this CasADi warns
     n, m, T = problem.states, problem.controls, sum(mesh.counts)
     hidden = len(problem.hidden(np.zeros((1, problem.scores))))
-    x0, p = ca.SX.sym("x0", n), ca.SX.sym("p", hidden)
-    u, x = ca.SX.sym("u", m, T), ca.SX.sym("x", n, T)
+    x0 = ca.SX.sym("x0", n)
+    p = ca.SX.sym("p", hidden)
+    u = ca.SX.sym("u", m, T)
+    x = ca.SX.sym("x", n, T)
     h = ca.SX.sym("h", sum(phase.end is not None for phase in problem.phases))
-    parameters, lengths = tuple(ca.vertsplit(p)), iter(ca.vertsplit(h))
-    state, t, cost, defects, circles, events, norms = tuple(ca.vertsplit(x0)), 0, 0, [], [], [], []
+    parameters = tuple(ca.vertsplit(p))
+    lengths = iter(ca.vertsplit(h))
+    state = tuple(ca.vertsplit(x0))
+    t = 0
+    cost = 0
+    defects, circles, events, norms = [], [], [], []
     for phase, count in zip(problem.phases, mesh.counts):
         dt = problem.dt / mesh.refine
         length = dt if phase.end is None else next(lengths)
@@ -106,7 +116,8 @@ def program(problem: Problem, mesh: Mesh, defect: Callable, in_circles: bool):
                 events.append((problem.with_parameters(phase.end, parameters)(state_next), is_last))
             if problem.u_norm is not None:
                 norms.append(sum(ui**2 for ui in controls))
-            state, t = state_next, t + 1
+            state = state_next
+            t += 1
         d = problem.distances(phase, state)
         cost += phase.Qf * sum(di**2 for di in d)
         if phase.terminal is not None:
@@ -125,7 +136,7 @@ def program(problem: Problem, mesh: Mesh, defect: Callable, in_circles: bool):
 
 @cache
 def solver(problem: Problem, mesh: Mesh, defect: Callable, in_circles: bool):
-    """IPOPT for `program`, built once per process: its CasADi function and the arguments that no start changes."""
+    """IPOPT for `program`, built once per process: its CasADi function, and the arguments that all starts share."""
     import casadi as ca
 
     options = {
@@ -158,7 +169,7 @@ def solver(problem: Problem, mesh: Mesh, defect: Callable, in_circles: bool):
 
 
 def why_no_symbols(problem: Problem, error: Exception) -> str:
-    """One line on what CasADi cannot take in a table's functions."""
+    """One line that says what CasADi cannot take in a table's functions."""
     if "truth value" in str(error):
         allowed = "no `if`, `min` or `max` of Python, but NumPy's `where`, `minimum` and `maximum`"
         return f"the dynamics of {problem.env_id} decide by a value; they may hold {allowed}"
@@ -168,25 +179,25 @@ def why_no_symbols(problem: Problem, error: Exception) -> str:
 
 
 class Sketch(NamedTuple):
-    """A guess or solution of a phase, whatever its steps: controls (K, m) held between the states (K+1, n), seconds."""
+    """A guess or solution of a phase, in any number K of steps."""
 
-    u: np.ndarray
-    x: np.ndarray
-    seconds: float
+    u: np.ndarray  # (K, m) controls, held between the states
+    x: np.ndarray  # (K+1, n) states
+    seconds: float  # duration of the phase
 
 
 def lasting(times: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """The controls u (K, m), each held for a K-th of the time 0 to 1, at the middle of the steps between `times`."""
+    """The controls at mid-step between `times`. Each of u (K, m) is held for 1 / K of the time 0 to 1."""
     middle = (times[:-1] + times[1:]) / 2
     return u[np.minimum((middle * len(u)).astype(int), len(u) - 1)]
 
 
 def placed(problem: Problem, mesh: Mesh, sketches: list[Sketch]) -> np.ndarray:
-    """The unknowns of a mesh, as the sketches of the phases have them."""
+    """The unknowns of a mesh, interpolated from the sketches of the phases."""
     controls, states, lengths = [], [], []
     for phase, count, sketch in zip(problem.phases, mesh.counts, sketches):
         times = np.linspace(0, 1, count + 1)
-        if phase.end is not None and not mesh.stretched:  # whole steps, and a last one
+        if phase.end is not None and not mesh.stretched:  # whole steps and a shorter last one
             times = np.minimum(np.arange(count + 1) * problem.dt / sketch.seconds, 1.0)
             times[-1] = 1.0
         controls.append(lasting(times, sketch.u))
@@ -199,9 +210,10 @@ def placed(problem: Problem, mesh: Mesh, sketches: list[Sketch]) -> np.ndarray:
 
 
 def sketches_of(problem: Problem, mesh: Mesh, x0, solution: np.ndarray) -> list[Sketch]:
-    """The unknowns of a solution by phase; `placed` turns them into those of another mesh."""
+    """The unknowns of a solution by phase. `placed` turns them into those of another mesh."""
     T, n, m = sum(mesh.counts), problem.states, problem.controls
-    u, x = solution[: m * T].reshape(T, m), np.vstack([x0, solution[m * T : (m + n) * T].reshape(T, n)])
+    u = solution[: m * T].reshape(T, m)
+    x = np.vstack([x0, solution[m * T : (m + n) * T].reshape(T, n)])
     lengths = iter(solution[(m + n) * T :])
     sketches, begin = [], 0
     for phase, count in zip(problem.phases, mesh.counts):
@@ -215,11 +227,11 @@ def sketches_of(problem: Problem, mesh: Mesh, x0, solution: np.ndarray) -> list[
 
 
 def guess_policies(problem: Problem) -> list[Callable]:
-    """The feedback laws whose flights are guesses.
+    """The feedback laws whose flights are guesses: the table's own law, if it has one.
 
-    With costs by weights LQR about the targets, and full control along the velocity, which adds most energy, wherever
-    that LQR saturates (for two states and one control). With others the middle of the set of controls and its ends, or
-    the table's own law.
+    Otherwise, with costs by weights, they are LQR about the targets and, for two states and one control, a law that
+    replaces a saturated LQR by full control along the velocity, which adds most energy. With other costs they are the
+    middle of the set of controls and its ends.
     """
     low, high = problem.u_box
     if problem.guess is not None:
@@ -241,7 +253,7 @@ def guess_policies(problem: Problem) -> list[Callable]:
 
 
 def law_of(problem: Problem, law: Callable) -> Callable:
-    """A feedback law u = law(x) of the table as a policy for `envs.fly`."""
+    """The policy for `envs.fly` of a table's feedback law u = law(x)."""
 
     def policy(obs, t):
         controls = law(tuple(obs[:, : problem.states].T))
@@ -252,17 +264,18 @@ def law_of(problem: Problem, law: Callable) -> Callable:
 
 
 def guesses(problem: Problem, x0, draw):
-    """Where IPOPT begins from the start x0 (n,): yields the sketches of the phases.
+    """Yield IPOPT's guesses for the start x0 (n,), each as the sketches of the phases.
 
-    The first rests on the targets in the middle of the set of controls, which is all with `Problem.single_optimum`.
-    Otherwise more: straight lines from the start to the targets, and the flights of `guess_policies` that do not
-    diverge. A guess is the start's own, so that a solution depends neither on its neighbours nor on how the starts are
-    shared out.
+    The first guess rests on the targets, in the middle of the set of controls. With `Problem.single_optimum` it is the
+    only one. The next guess is straight lines from the start to the targets. Then come the flights of `guess_policies`
+    that do not diverge. Each start has its own guesses, so its solution does not depend on other starts or on how
+    processes share the starts.
 
-    Chosen on pendulums x2' = sin x1 + u swung up with |u| <= 0.2 to 0.3, 20 starts each. Over 10 to 15 s the first
-    guess ended above the best of the four at up to 5 % of the starts, with up to 1.46 of their sum of costs; over 20 s
-    it failed at 85 %, the two flights at none. They take less time than the first two. Full control of either sign, no
-    control, and full control against the velocity added little. The best of four can still be a local optimum.
+    We chose the guesses on pendulums x2' = sin x1 + u, swung up with |u| <= 0.2 to 0.3 from 20 starts each. Over 10 to
+    15 s the first guess ended above the best of the four at up to 5 % of the starts, with up to 1.46 of their sum of
+    costs. Over 20 s the first guess failed at 85 % of the starts, and the two flights at none. The flights take less
+    time than the first two guesses. Full control of either sign, no control, and full control against the velocity
+    added little. The best of four can still be a local optimum.
     """
     corners = [np.asarray(x0, dtype=float)]
     for phase in problem.phases:
@@ -273,7 +286,7 @@ def guesses(problem: Problem, x0, draw):
         middle = np.eye(problem.controls)[-1] * np.mean(problem.u_norm)
 
     def resting(phase, x):
-        share = 0.5 if phase.end is not None else 1.0  # of the longest time
+        share = 0.5 if phase.end is not None else 1.0  # share of the longest time
         return Sketch(np.tile(middle, (phase.steps, 1)), x, share * phase.steps * problem.dt)
 
     yield [resting(phase, np.tile(end, (phase.steps + 1, 1))) for phase, end in zip(problem.phases, corners[1:])]
@@ -282,16 +295,17 @@ def guesses(problem: Problem, x0, draw):
     lines = zip(problem.phases, corners[:-1], corners[1:])
     yield [resting(phase, np.linspace(begin, end, phase.steps + 1)) for phase, begin, end in lines]
     for policy in guess_policies(problem):
-        with suppress(BadInput), np.errstate(all="ignore"):  # a state that overflows gives an action that is refused
+        with suppress(BadInput), np.errstate(all="ignore"):  # an overflowing state gives an action that is refused
             sketches = flown_sketches(problem, policy, x0, draw)
             if sketches is not None:
                 yield sketches
 
 
 def flown_sketches(problem: Problem, policy, x0, draw) -> list[Sketch] | None:
-    """The flight of a policy as sketches; None where it diverges, or has events and several phases."""
+    """The flight of a policy as sketches. None if it diverges, or if there are events and several phases."""
     flight = fly(problem.env_id, policy, x0[None], draw[None])
-    x, u = flight["x"][0], flight["u"][0].reshape(problem.steps, problem.controls)
+    x = flight["x"][0]
+    u = flight["u"][0].reshape(problem.steps, problem.controls)
     if problem.has_events:
         flown = int(np.isfinite(u).all(axis=1).sum())
         beyond = np.abs(x[: flown + 1]) > problem.x_max
@@ -306,7 +320,7 @@ def flown_sketches(problem: Problem, policy, x0, draw) -> list[Sketch] | None:
 
 
 class Job(NamedTuple):
-    """A start to be solved; it holds all that a process needs."""
+    """A start that is to be solved, with all that a process needs."""
 
     env_id: str
     defect: Callable
@@ -317,14 +331,14 @@ class Job(NamedTuple):
 
 
 class Solution(NamedTuple):
-    """What IPOPT found on a mesh; `status` is IPOPT's."""
+    """What IPOPT found on a mesh."""
 
     mesh: Mesh
     unknowns: np.ndarray
     cost: float
-    multipliers: np.ndarray  # of the circles
+    multipliers: np.ndarray  # of the circles' constraints
     bound_price: float  # the least `Problem.bound_price` with which crossing a bound does not pay
-    status: str
+    status: str  # IPOPT's return status
 
     @property
     def succeeded(self) -> bool:
@@ -332,7 +346,7 @@ class Solution(NamedTuple):
 
 
 def solve_on(problem: Problem, mesh: Mesh, job: Job, sketches: list[Sketch]) -> Solution:
-    """Solve from a guess."""
+    """Solve a job on a mesh, from a guess."""
     solve, arguments = solver(problem, mesh, job.defect, job.in_circles)
     p = [float(value[0]) for value in problem.hidden(job.draw[None])]
     found = solve(p=np.concatenate([job.x0, p]), x0=placed(problem, mesh, sketches), **arguments)
@@ -348,10 +362,10 @@ def solve_on(problem: Problem, mesh: Mesh, job: Job, sketches: list[Sketch]) -> 
 
 
 def held_steps(problem: Problem, job: Job, stretched: Solution) -> Solution:
-    """The solution in the environment's own steps, from one that has found out how long the phases are.
+    """The solution in the environment's own steps, from a stretched one that has found out how long the phases are.
 
-    The number of steps is that of the stretched solution. Where the last step of a phase ends at 0 or dt, a neighbour
-    may be better, and is tried.
+    The number of steps is first that of the stretched solution. If the last step of a phase has the length 0 or dt, one
+    step less or more may be better, and is tried.
     """
     sketches = sketches_of(problem, stretched.mesh, job.x0, stretched.unknowns)
 
@@ -382,7 +396,10 @@ def held_steps(problem: Problem, job: Job, stretched: Solution) -> Solution:
 
 @interruptible()
 def best_solution(job: Job) -> tuple[Solution, bool]:
-    """The best solution of a start's guesses in the environment's steps, and whether it is one."""
+    """The best solution of a start's guesses in the environment's steps, and whether IPOPT succeeded.
+
+    Raises NoOptimum if no guess leads to a solution, unless circles, bounds or events are out of reach.
+    """
     problem = PROBLEMS[job.env_id]
     mesh = Mesh.of(problem)
     found: list[Solution] = []
@@ -393,7 +410,7 @@ def best_solution(job: Job) -> tuple[Solution, bool]:
         found.append(solution)
     solved = [solution for solution in found if solution.succeeded]
     statuses = dict.fromkeys(solution.status for solution in found)
-    # circles, bounds and events can be out of reach: without them every control has its trajectory
+    # circles, bounds and events can be out of reach; without them every control has a trajectory
     can_be_infeasible = job.in_circles or problem.bounds or problem.has_events
     if not solved and not (can_be_infeasible and "Infeasible_Problem_Detected" in statuses):
         where = f"start {job.index}, x0 = {job.x0.tolist()}, of {job.env_id}"
@@ -403,14 +420,14 @@ def best_solution(job: Job) -> tuple[Solution, bool]:
 
 @interruptible()
 def refined(job: Job, best: Solution, factor: int) -> Solution:
-    """The solution of a start with steps that are `factor` times shorter, by the job's defect, from its best one."""
+    """The solution in steps that are `factor` times shorter, with the job's defect, from the start's best solution."""
     problem = PROBLEMS[job.env_id]
     sketches = sketches_of(problem, best.mesh, job.x0, best.unknowns)
     return solve_on(problem, best.mesh.refined(factor), job, sketches)
 
 
 def why_it_stopped(statuses) -> str:
-    """The usual cause of a solve that does not end."""
+    """The usual cause of a solve that does not end, in words."""
     if "Maximum_Iterations_Exceeded" in statuses or "Restoration_Failed" in statuses:
         return (
             " (the usual cause: a function with a step or kink, as np.sign, np.clip or np.abs, or one that is NaN in"

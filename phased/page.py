@@ -1,4 +1,4 @@
-"""What a small problem's page needs of Python: its table and the policy. pages/plane_physics.js reads them."""
+"""The data of a small problem's page: its table and the policy. pages/plane_physics.js reads them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ DYNAMICS = ("double_integrator", "van_der_pol")  # functions of envs.py that pag
 def page(problem: Problem, arrays: dict, checkpoint: dict) -> Page:
     """The page of a policy: the phase plane, in which its start is dragged.
 
-    BadInput where the problem is not written in JavaScript, or the policy has other features.
+    Raises BadInput if the problem is not written in JavaScript, or if the policy has other features.
     """
     f = problem.f
     known = f.__module__ == "envs" and f.__name__ in DYNAMICS
@@ -40,7 +40,7 @@ def page(problem: Problem, arrays: dict, checkpoint: dict) -> Page:
 
 
 def is_plain(problem: Problem) -> bool:
-    """Whether it has nothing that the page's physics leave out."""
+    """Whether the page's physics has all that the table has."""
     more = [problem.has_events, problem.scores, problem.bounds, problem.x0, problem.u_norm, problem.substeps > 1]
     more += [phase.f is not None for phase in problem.phases]
     aimed = all(None not in problem.targets_of(phase) for phase in problem.phases)
@@ -48,7 +48,7 @@ def is_plain(problem: Problem) -> bool:
 
 
 def constants(problem: Problem) -> dict:
-    """The table."""
+    """The table's constants."""
     low, high = problem.u_box[:, 0].tolist()
     return {
         "dynamics": problem.f.__name__,
@@ -66,7 +66,7 @@ def constants(problem: Problem) -> dict:
 
 
 def phase_constants(problem: Problem, phase: Phase) -> dict:
-    """A phase's column of the table."""
+    """The constants of one phase."""
     return {
         "steps": phase.steps,
         "target": phase.target,

@@ -1,7 +1,7 @@
 """The table of a small problem: dynamics, controls, starts and phases. A problem of your own is such a table.
 
-Not for a table: states that jump between phases, parameters that the optimum may choose, costs with explicit time (make
-the clock a state), and final times that are chosen without an event.
+A table cannot have states that jump between phases, parameters that the optimum may choose, costs with explicit time
+(make the clock a state), or final times that are chosen without an event.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ LARGEST_SCORE = 3.0  # standard scores are drawn within +-3
 
 
 def lists_to_tuples(table):
-    """Make lists and arrays of a table tuples: equal tables are then one key of what is solved once."""
+    """Turn a table's lists and arrays into tuples, so that equal tables are one key of the cache of solutions."""
     for name, value in vars(table).items():
         if isinstance(value, list | np.ndarray):
             object.__setattr__(table, name, tuple(value))
@@ -28,24 +28,24 @@ def lists_to_tuples(table):
 
 @dataclass(frozen=True)
 class Phase:
-    """One column of a parameter table: how long, what it costs, and where it should end.
+    """One column of a parameter table: how long a phase is, what it costs, and where it should end.
 
-    The cost is by weights, as the paper's, or by functions, or both:
+    The cost is given by weights, as in the paper, or by functions, or by both:
 
-    - weights, about the target's distance d: d'Q d + R u^2, summed over the steps, and Qf |d|^2 at the phase's end
+    - weights, with d the distance to the target: d'Q d + R u^2, summed over the steps, and Qf |d|^2 at the phase's end
     - `running(x, u)`, integrated over the phase's time, and `terminal(x)` at its end
 
-    Every function of a table takes x as a tuple of states. With hidden parameters it takes them, too, as its last
-    argument, a tuple: f(x, u, p), running(x, u, p), terminal(x, p), end(x, p).
+    Every function of a table takes x as a tuple of states. With hidden parameters it also takes their tuple p as its
+    last argument: f(x, u, p), running(x, u, p), terminal(x, p), end(x, p).
     """
 
-    steps: int  # duration / dt; with `end` the longest
+    steps: int  # duration / dt; with `end` the longest duration
     target: tuple[float | None, ...] | None = None  # of each state, at the phase's end; None: free
-    radius: float | tuple[float, ...] = math.inf  # r_target; a tuple: of each state with a target, an ellipse's axes
-    R: float | tuple[float, ...] = 0.0  # weight of the control, or of each
+    radius: float | tuple[float, ...] = math.inf  # r_target; a tuple has an ellipse's axes, one for each aimed state
+    R: float | tuple[float, ...] = 0.0  # weight of the control, or of each control
     Qf: float = 0.0  # weight of |d|^2 at the end
     bonus: float = 0.0  # terminal bonus B, paid within the radius
-    Q: tuple[float, ...] | None = None  # weight of each state; left out 1, with `running` or `terminal` 0
+    Q: tuple[float, ...] | None = None  # weight of each state; None: 1, or 0 with `running` or `terminal`
     running: Callable | None = None  # cost for each second
     terminal: Callable | None = None  # cost at the end
     end: Callable | None = None  # the phase ends at the moment when end(x) falls through 0
@@ -58,56 +58,58 @@ class Phase:
 
     @property
     def weighted(self) -> bool:
-        """Whether its cost is the paper's: weights alone."""
+        """Whether its cost is the paper's, by weights alone."""
         return self.running is None and self.terminal is None and self.target is not None
 
     @property
     def has_circle(self) -> bool:
-        """Whether its end may hit or miss."""
+        """Whether its end can hit or miss a circle."""
         return self.radius != math.inf
 
     @property
     def circle_radius(self) -> float:
-        """What `Problem.circle_distance` must not exceed: the radius, or 1 where the distance is in radii."""
+        """The bound of `Problem.circle_distance`: the radius, or 1 if the distance is in radii."""
         return 1.0 if isinstance(self.radius, tuple) else self.radius
 
 
 @dataclass(frozen=True)
 class Problem:
-    """A parameter table. It has n states and m controls: as many as `x_max` and `u_max` have numbers.
+    """A parameter table with n states and m controls, as many as `x_max` and `u_max` have numbers.
 
-    With one number as `u_max` the control is a bare number u, with a tuple it is a tuple. The set of controls is the
-    box from `u_min` (-u_max) to `u_max`, or with `u_norm` all vectors from a least to a greatest norm.
+    If `u_max` is one number, the control is a number u. If it is a tuple, the control is a tuple. The set of controls
+    is the box from `u_min` (by default -u_max) to `u_max`. With `u_norm` it is all vectors from a least to a greatest
+    norm.
 
-    An episode begins in the box `x0` +- `x0_max`. With `scores` k it draws k standard scores z, clipped at +-3, before.
+    An episode begins in the box `x0` +- `x0_max`. With `scores` k it first draws k standard scores z, clipped at +-3.
     `x0` may then be a function of z, a tuple of k arrays, and `parameters(z)` gives the hidden parameters p.
 
     `bounds` are constraints in the optimum. The environment charges `bound_price` for each second at a distance of one
     `x_scale` beyond them.
 
-    `single_optimum` is a promise that IPOPT ends in the same optimum from every guess, so that the reference tries one
-    (see `baselines.guesses`): left out, a new problem's reference is the best of several.
+    `single_optimum` promises that IPOPT ends in the same optimum from every guess, so the reference tries one guess
+    (`baselines.guesses`). Without it the reference is the best of several. Raises BadInput for a table that cannot be
+    flown.
     """
 
     env_id: str
     f: Callable  # x' = f(x, u), a tuple of n derivatives
     u_max: float | tuple[float, ...]
     phases: tuple[Phase, ...]
-    x_max: tuple[float, ...]  # a bound of every reachable |state| (the observation's box), never a constraint
-    dt: float = 0.1  # s, of a step: a control is held for it
-    x0_max: float | tuple[float, ...] = 1.0  # the table's "state bounds", by our reading the box of the initial states
+    x_max: tuple[float, ...]  # a bound of every reachable |state|, for the observation's box; never a constraint
+    dt: float = 0.1  # s, a step, for which a control is held
+    x0_max: float | tuple[float, ...] = 1.0  # the paper's "state bounds", by our reading the box of initial states
     single_optimum: bool = False
     guess: Callable | None = None  # u = guess(x), a feedback law whose flight is one more guess at the optimum
     u_min: float | tuple[float, ...] | None = None  # None: -u_max
     u_norm: tuple[float, float] | None = None  # least and greatest norm of the control vector
-    u_scale: float | None = None  # an action of 1 with `scaled_action`; None: half the width of the set of controls
-    x0: tuple[float, ...] | Callable | None = None  # centre of the box, None: the origin; or a function of z
+    u_scale: float | None = None  # the control of a scaled action of 1; None: half the width of the set of controls
+    x0: tuple[float, ...] | Callable | None = None  # centre of the box (None: the origin), or a function of z
     scores: int = 0  # number of standard scores z
     parameters: Callable | None = None  # hidden parameters of z
     bounds: tuple[tuple[float | None, float | None] | None, ...] | None = None  # least and greatest of each state
     bound_price: float = 0.0
     x_scale: tuple[float, ...] | None = None  # a usual size of each state; None: 1
-    velocities: tuple[int, ...] | None = None  # the states that `observe_velocity=False` hides; None: of two the second
+    velocities: tuple[int, ...] | None = None  # states that `observe_velocity=False` hides; None: the second of two
     substeps: int = 1  # Runge-Kutta steps in a step
     x_names: tuple[str, ...] | None = None
     u_names: tuple[str, ...] | None = None
@@ -118,7 +120,7 @@ class Problem:
 
     @property
     def steps(self) -> int:
-        """Number of steps T of an episode, with events of the longest."""
+        """The number of steps T of an episode, with events of the longest episode."""
         return sum(phase.steps for phase in self.phases)
 
     @property
@@ -133,17 +135,17 @@ class Problem:
 
     @property
     def states(self) -> int:
-        """Their number n."""
+        """The number of states n."""
         return len(self.x_max)
 
     @property
     def controls(self) -> int:
-        """Their number m."""
+        """The number of controls m."""
         return len(self.u_max) if isinstance(self.u_max, tuple) else 1
 
     @property
     def weighted(self) -> bool:
-        """Whether all its cost is by weights, as the paper's."""
+        """Whether all costs are by weights, as in the paper."""
         return all(phase.weighted for phase in self.phases)
 
     @property
@@ -153,17 +155,17 @@ class Problem:
 
     @property
     def has_one_flight(self) -> bool:
-        """Whether all episodes begin alike."""
+        """Whether all episodes have the same start."""
         return not self.scores and not np.any(self.x0_max)
 
     @property
     def circles_count(self) -> bool:
-        """Whether the optimum has to end in the circles: not with one phase by weights, where its J alone counts."""
+        """Whether the optimum has to end in the circles. With one phase by weights only J counts, so it need not."""
         return any(phase.has_circle for phase in self.phases) and (self.waypoints or not self.weighted)
 
     @property
     def u_box(self) -> np.ndarray:
-        """Least and greatest of each control, (2, m)."""
+        """The least and the greatest value of each control, (2, m)."""
         high = np.atleast_1d(self.u_max).astype(float)
         low = -high if self.u_min is None else np.atleast_1d(self.u_min).astype(float)
         return np.array([low, high])
@@ -175,7 +177,7 @@ class Problem:
 
     @property
     def u_unit(self) -> np.ndarray:
-        """What an action of 1 adds to the middle, (m,): `u_scale`, or half the width."""
+        """The control (m,) that a scaled action of 1 adds to the middle: `u_scale`, or half the width."""
         low, high = self.u_box
         return (high - low) / 2 if self.u_scale is None else np.full(self.controls, self.u_scale)
 
@@ -186,7 +188,7 @@ class Problem:
 
     @property
     def limits(self) -> np.ndarray:
-        """Least and greatest allowed value of each state, (2, n), infinite where it is free."""
+        """The least and the greatest allowed value of each state, (2, n), infinite for a free state."""
         rows = [(None, None) if row is None else row for row in self.bounds or [None] * self.states]
         low = [-math.inf if least is None else least for least, _ in rows]
         high = [math.inf if greatest is None else greatest for _, greatest in rows]
@@ -194,7 +196,7 @@ class Problem:
 
     @property
     def hidden_velocities(self) -> tuple[int, ...]:
-        """The states that are velocities."""
+        """The indices of the states that are velocities."""
         if self.velocities is not None:
             return self.velocities
         return (1,) if self.states == 2 else ()
@@ -217,17 +219,17 @@ class Problem:
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """What the cost is the sum of."""
+        """The names of the cost's parts."""
         weights = ("state", "control") if any(phase.weighted or phase.R for phase in self.phases) else ()
         running = ("running",) if any(phase.running for phase in self.phases) else ()
         return (*weights, *running, "terminal", *(("bounds",) if self.bounds else ()))
 
     def targets_of(self, phase: Phase) -> tuple[float | None, ...]:
-        """The target of each state, None where it is free."""
+        """The target of each state, None for a free state."""
         return (None,) * self.states if phase.target is None else phase.target
 
     def state_weights(self, phase: Phase) -> tuple[float, ...]:
-        """Q of each state; 0 where it has no target."""
+        """Q of each state, 0 without a target."""
         if phase.target is None or phase.Q is None:
             return (0.0,) * self.states
         return tuple(0.0 if target is None else weight for weight, target in zip(phase.Q, phase.target))
@@ -237,16 +239,16 @@ class Problem:
         return phase.R if isinstance(phase.R, tuple) else (phase.R,) * self.controls
 
     def distances(self, phase: Phase, x) -> list:
-        """The distance to its target of each state that has one."""
+        """The signed distances to the target, of the states that have one."""
         return [xi - target for xi, target in zip(x, self.targets_of(phase)) if target is not None]
 
     def radii(self, phase: Phase) -> tuple[float, ...]:
-        """The radius in each state that has a target."""
+        """The radii, of the states that have a target."""
         count = sum(target is not None for target in self.targets_of(phase))
         return phase.radius if isinstance(phase.radius, tuple) else (phase.radius,) * count
 
     def circle_distance(self, phase: Phase, x) -> np.ndarray:
-        """The distance (n,) of states x, a tuple of arrays, to a phase's target; in radii where each has its own."""
+        """The distance (n,) of states x, a tuple of arrays, to a phase's target; in radii if `radius` is a tuple."""
         d = self.distances(phase, x)
         if not d:
             return np.zeros_like(x[0])
@@ -255,15 +257,15 @@ class Problem:
         return np.hypot.reduce(np.array(d), axis=0)
 
     def with_parameters(self, function, p) -> Callable:
-        """A function of the table as one that does not take the hidden parameters p."""
+        """A function of the table, with the hidden parameters p filled in."""
         if self.parameters is None:
             return function
         return lambda *arguments: function(*arguments, p)
 
     def step(self, phase: Phase, x, u, p, h) -> tuple:
-        """The states after h seconds, and the integral of `running` over them (0 without it): (x_next, cost).
+        """(x_next, cost): the states after h seconds, and the integral of `running` over them, 0 without it.
 
-        x is a tuple of n arrays or symbols, u one or a tuple, p the hidden parameters.
+        x is a tuple of n arrays or symbols, u is one of them or a tuple, and p has the hidden parameters.
         """
         f = self.with_parameters(phase.f or self.f, p)
         h = h / self.substeps if self.substeps > 1 else h
@@ -278,7 +280,7 @@ class Problem:
         return y[:-1], y[-1]
 
     def as_control(self, u):
-        """Rows u (m, ...) as the table's functions take them: a bare one, or a tuple."""
+        """Rows u (m, ...) as the table's functions take them: one row, or a tuple of rows."""
         return tuple(u) if isinstance(self.u_max, tuple) else u[0]
 
     def starts_in_box(self, rng: np.random.Generator, n: int) -> np.ndarray:
@@ -299,7 +301,7 @@ class Problem:
 
 
 class Tables(dict[str, Problem]):
-    """Tables by environment id. Raises BadInput where another table of this id is there, or the id is not its own."""
+    """Tables by environment id. Raises BadInput if the id is not the table's, or has another table already."""
 
     def __setitem__(self, env_id: str, problem: Problem):
         refuse_unless(env_id == problem.env_id, "the id", repr(env_id), f"must be the table's, {problem.env_id}")
@@ -312,23 +314,23 @@ PROBLEMS = Tables()  # `register_problem` of `environment.py` fills it
 
 
 def starts(seed: int, n: int, x0_max: float | tuple[float, ...] = 1.0) -> np.ndarray:
-    """The n starts (n, 2) of a seed, in evaluations and references: uniform in [-x0_max, x0_max] in each component.
+    """The n starts (n, 2) of a seed, in evaluations and references, uniform in [-x0_max, x0_max] in each component.
 
-    `x0_max` is the problem's, a number for each state or one for two; 1 are the paper's "state bounds".
+    `x0_max` is the problem's: a number for each state, or one number for two states. 1 is the paper's "state bounds".
     """
     bound = np.asarray(x0_max, dtype=float)
     return np.random.default_rng(seed).uniform(-bound, bound, (n, bound.size if bound.ndim else 2))
 
 
 def uniform(z, low: float, high: float):
-    """A number between low and high, all alike likely, of a standard score z: for functions of scores in a table."""
+    """A uniform number between low and high, from a standard score z, for functions of scores in a table."""
     from scipy.special import ndtr
 
     return low + (high - low) * ndtr(z)
 
 
 def flights_of_seed(problem: Problem, seed: int, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """The n flights of a seed, in evaluations and references: their starts (n, states) and draws (n, k)."""
+    """The starts (n, states) and draws (n, k) of the n flights of a seed, in evaluations and references."""
     rng = np.random.default_rng(seed)
     if callable(problem.x0):
         draw = problem.draw_scores(rng, n)

@@ -9,7 +9,7 @@ from phased.problem import Problem
 def table(problem: Problem, metrics: dict) -> str:
     """The table of an evaluation. The means are over all starts.
 
-    Where some miss a circle, the ratio of J is over the others and its parts have none.
+    If some starts miss a circle, the ratio of J is over the other starts, and the parts of J have no ratio.
     """
     rows = [("", "optimum", "ours", "ratio"), *cost_rows(problem, metrics), *hit_rows(problem, metrics)]
     width = max(len(label) for label, *_ in rows)

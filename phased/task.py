@@ -1,4 +1,4 @@
-"""What is asked of a small problem's id: see `common.tasks.Task`. `baselines.py` gives it the optimum."""
+"""The small problems' family: its answers to what `common.tasks.Task` asks of an id. `baselines.py` solves."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from phased.page import page as problem_page
 from phased.problem import Problem, flights_of_seed
 from phased.table import table
 
-KEPT_STARTS = 30  # in a results folder
+KEPT_STARTS = 30  # starts that a results folder keeps
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,8 @@ class PhasedTask(SampledTask):
 
     def evaluate(self, policy, eval_seed: int, n: int, reference: dict | None = None, **env_options):
         """As `Task.evaluate`. Raises ValueError if the reference belongs to other starts."""
-        problem, (x0, draw) = self.problem, flights_of_seed(self.problem, eval_seed, n)
+        problem = self.problem
+        x0, draw = flights_of_seed(problem, eval_seed, n)
         flight = fly(self.env_id, policy, x0, draw, **env_options)
         if reference is None:
             reference = self.optimum(eval_seed, n)
@@ -104,19 +105,22 @@ class PhasedTask(SampledTask):
     def figures(self, arrays: dict, metrics: dict, curves: list[dict]) -> dict:
         from phased.figures import cost_error_figure, costs_figure, trajectories_figure
 
-        problem, title, figures = self.problem, self.headline(metrics), {}
+        problem = self.problem
+        title = self.headline(metrics)
+        figures = {}
         if curves:
             figures["training.png"] = self.training_figure(metrics, curves)
         figures["trajectories.png"] = trajectories_figure(problem, arrays, title)
         if problem.has_one_flight:
             return figures
         figures["costs.png"] = costs_figure(problem, arrays, title)
-        if problem.states == 2 and problem.weighted and not problem.waypoints:  # there a missed circle would be a gain
+        # with waypoints a missed circle would look like a gain
+        if problem.states == 2 and problem.weighted and not problem.waypoints:
             figures["cost_error.png"] = cost_error_figure(problem, arrays, title)
         return figures
 
     def training_figure(self, metrics: dict, curves: list[dict]):
-        """The curves of a training, with what the mean action costs more than the optimum."""
+        """The training curves, with the extra cost of the mean action over the optimum."""
         from drawing.training import Miss, training_figure
 
         miss = Miss("eval/ratio_of_sums", "cost / optimum's, less 1, mean action", subtract=1.0)
@@ -133,7 +137,7 @@ class PhasedTask(SampledTask):
         return {"t", "x", "u", "reward", "cost", "x_reference", "u_reference", "cost_reference"}
 
     def kept_arrays(self, arrays: dict) -> dict:
-        """Of the first `KEPT_STARTS`; all arrays but the times are by start."""
+        """The arrays of the first `KEPT_STARTS` starts. All arrays but the times are by start."""
         return {key: array if key == "t" else array[:KEPT_STARTS] for key, array in arrays.items()}
 
     # --- what is taken along

@@ -1,4 +1,4 @@
-"""The rocket's picture that moves: its ascent in the target's plane, its pitch, the orbit that it would coast on."""
+"""The rocket's animation: its ascent in the target's plane, its pitch, and the orbit on which it would coast."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from rocket.vehicle import Rocket, engine_groups
 BODY = Outline([(1.0, 0.0), (0.45, 0.24), (-0.6, 0.24), (-0.6, -0.24), (0.45, -0.24), (1.0, 0.0)])
 FLAME = Outline([(-0.6, 0.2), (-1.6, 0.0), (-0.6, -0.2), (-0.6, 0.2)])
 EARTH, FAILURE = "#d7e6f2", "crimson"
-ALTITUDE, DOWNRANGE = 60.0, 600.0  # km: what the axes of a flight that has just begun show
+ALTITUDE, DOWNRANGE = 60.0, 600.0  # km, the size of the axes when a flight has just begun
 
 
 class AscentSheet(Sheet):
-    """A rocket's ascent in the target's plane with its stagings, its pitch, and the orbit that it would coast on."""
+    """A rocket's ascent in the target's plane with its stagings, its pitch, and the orbit on which it would coast."""
 
     def __init__(
         self, rocket: Rocket, title: str = "Rocket ascent", compared: bool = False, vehicle: Vehicles | None = None
     ):
-        """`vehicle`: the one that was drawn for the flight, whose stagings and failure are shown."""
+        """`vehicle` is the flight's drawn vehicle, whose stagings and failure are shown."""
         super().__init__(title)
         self.rocket, self.axes = rocket, target_axes(rocket)
         self.stagings = stagings(rocket, vehicle)
@@ -49,7 +49,7 @@ class AscentSheet(Sheet):
         self.moving += [self.failed, self.cross] if self.strike else []
 
     def _draw_orbit_panel(self):
-        """The target's plane to scale, perigee to the right: Earth and the target orbit."""
+        """Draw Earth and the target orbit in the target's plane, to scale, with the perigee to the right."""
         Re, a, e = self.rocket.Re, self.rocket.a, self.rocket.e
         self.orbit.add_patch(Circle((0, 0), Re, facecolor=EARTH, edgecolor="0.6", linewidth=0.6, zorder=0))
         self.orbit.plot(
@@ -57,7 +57,7 @@ class AscentSheet(Sheet):
         )
         low, high, side = -a * (1 + e), max(a * (1 - e), Re), max(a * np.sqrt(1 - e * e), Re)
         margin = 0.06 * (high - low)
-        top = side + 3 * margin  # room for the caption: a title above a round orbit would meet the figure's
+        top = side + 3 * margin  # room for the caption, because a title above would meet the figure's title
         self.orbit.set(xlim=(low - margin, high + margin), ylim=(-side - margin, top), aspect="equal")
         self.orbit.set_axis_off()
         caption = "orbit if the engines stopped now, and the target"
@@ -70,7 +70,7 @@ class AscentSheet(Sheet):
         return a * (1 - e) * perigee, np.sqrt(self.rocket.mu / a * (1 + e) / (1 - e)) * ahead
 
     def _draw_target_altitude(self):
-        """The target orbit's altitude over the downrange from the pad, half a turn of it."""
+        """Draw the target orbit's altitude over the downrange from the pad, for half a turn."""
         angle = self.launch + np.linspace(0, np.pi, 721)
         r = self.rocket.a * (1 - self.rocket.e**2) / (1 + self.rocket.e * np.cos(angle))
         x, y = (angle - self.launch) * self.rocket.Re / 1e3, (r - self.rocket.Re) / 1e3
@@ -91,7 +91,7 @@ class AscentSheet(Sheet):
         self.body = self.ascent.plot([], [], color=POLICY["color"], markersize=17, **edge, **look)[0]
 
     def _prepare_events(self):
-        """What is dropped at the end of each burn and what fails, unseen until it happens; the end of the flight."""
+        """Prepare the labels of stagings, failure and end of the flight. They are invisible until they happen."""
         for time, _ in self.stagings:
             self.pitch.axvline(time, **BOUNDARY)
         self.marks = self.ascent.plot([], [], "o", color="k", markersize=4, zorder=8)[0]
@@ -102,12 +102,12 @@ class AscentSheet(Sheet):
         if self.strike:
             time, text = self.strike
             self.pitch.axvline(time, **{**BOUNDARY, "color": FAILURE})
-            side = "left" if time <= self.rocket.end_time / 2 else "right"  # towards the middle: inside the panel
+            side = "left" if time <= self.rocket.end_time / 2 else "right"  # text towards the middle stays inside
             self.failed = self.pitch.text(time, 78, f" {text} ", ha=side, color=FAILURE, fontsize=8, weight="bold")
             self.cross = self.ascent.plot([], [], "X", color=FAILURE, markersize=8, zorder=9)[0]
 
     def _prepare_readings(self):
-        """Below the orbit: the clock, and of each side altitude, speed, mass, perigee and apogee."""
+        """Prepare the readings below the orbit: the clock, and each side's altitude, speed, mass and apsides."""
         self.clock = self.figure.text(0.635, 0.275, "", fontsize=9, weight="bold")
         rows = "altitude (km)\nspeed (km/s)\nmass (t)\nperigee (km)\napogee (km)"
         look = {"fontsize": 8, "va": "top", "linespacing": 1.35}
@@ -129,12 +129,12 @@ class AscentSheet(Sheet):
         return (angle - self.launch) * self.rocket.Re / 1e3, altitude / 1e3
 
     def _orbit(self, y: np.ndarray) -> np.ndarray:
-        """The orbit (2, n), m, in the target's plane on which a state y (r, v, ...) would coast; cut far from Earth."""
+        """The orbit (2, n) in m, in the target's plane, on which a state y (r, v, ...) would coast; cut far out."""
         h, e = (np.array(vector) for vector in orbit_vectors(y, self.rocket.mu))
         size = np.linalg.norm(e)
         along = e / size if size > 1e-9 else y[:3] / np.linalg.norm(y[:3])
         across = np.cross(h / max(np.linalg.norm(h), 1e-300), along)  # a launch from a pole begins with h = 0
-        # half angles, so that an almost straight fall has points at its far end, too
+        # half angles also give an almost straight fall points at its far end
         half = np.arctan(np.sqrt((1 + size) / max(abs(1 - size), 1e-9)) * np.tan(np.linspace(-np.pi, np.pi, 361) / 2))
         slowness = 1 + size * np.cos(2 * half)
         r = h @ h / self.rocket.mu / np.where(slowness > 1e-9, slowness, np.nan)
@@ -142,7 +142,7 @@ class AscentSheet(Sheet):
         return (self.axes @ np.where(r < 20 * self.rocket.a, points, np.nan))[:2]
 
     def fit(self, flights: list[Flight]):
-        """Axes that hold all these flights."""
+        """Set axes that hold all these flights."""
         tracks = [self._track(flight.y) for flight in flights]
         x, altitude = (np.concatenate(values) for values in zip(*tracks))
         top, right = room(ALTITUDE, 1.1 * altitude), room(DOWNRANGE, 1.03 * x)
@@ -152,7 +152,7 @@ class AscentSheet(Sheet):
         self.ascent.set(xlim=(min(-0.03 * right, 1.03 * x.min()), right), ylim=(-0.06 * top, top))
 
     def show(self, *sides: list[Flight], ended: bool = False):
-        """Draw the one flight of each side as far as it goes; `ended`: the policy's goes no further."""
+        """Draw the one flight of each side as far as it goes. `ended` says that the policy's flight has ended."""
         flights = [flight for (flight,) in sides]
         for flight, path, pitch, orbit, dot, reading in zip(
             flights, self.paths, self.pitches, self.orbits, self.dots, self.readings
@@ -176,7 +176,7 @@ class AscentSheet(Sheet):
         return f"{altitude / 1e3:.1f}\n{speed / 1e3:.2f}\n{y[6] / 1e3:.2f}\n{perigee / 1e3:.0f}\n{apogee}"
 
     def _show_rocket(self, flight: Flight, ended: bool):
-        """The rocket at the path's head, pointing at its pitch; its flame goes out at the end."""
+        """Draw the rocket at the path's head, at its pitch. Its flame goes out at the end."""
         x, altitude = self._track(flight.y)
         pitch = pitch_above_horizon(flight)[-1] if len(flight.u) else 90.0
         turn = Affine2D().rotate_deg(pitch)
@@ -210,7 +210,7 @@ class AscentSheet(Sheet):
 
 
 def stagings(rocket: Rocket, vehicle: Vehicles | None) -> list[tuple[float, str]]:
-    """When the burns end, the last excepted, and what is dropped then; of a drawn vehicle or of the nominal one."""
+    """The ends (s) of all burns but the last and what is dropped then, for a drawn vehicle or the nominal one."""
     if vehicle is None:
         ends, dropped = [burn.end for burn in rocket.burns], rocket.jettison
     else:
@@ -225,7 +225,7 @@ def stagings(rocket: Rocket, vehicle: Vehicles | None) -> list[tuple[float, str]
 
 
 def loss_of_thrust(rocket: Rocket, vehicle: Vehicles) -> tuple[float, str] | None:
-    """When the failure of a drawn vehicle strikes, and what it takes; None of a healthy one."""
+    """The time (s) when a drawn vehicle's failure strikes, and its loss in words. None for a healthy one."""
     group, time, share = vehicle.failure[:, 0]
     if group < 0:
         return None

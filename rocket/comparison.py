@@ -2,8 +2,9 @@
 
     python evaluate.py opponents results/rocket_cutoff --also again=results/rocket_cutoff/agent.safetensors
 
-`guidance.py` has the opponents; here they are flown, measured as a policy is, and printed. Policies are flown by their
-script in processes of its own: nothing imports a script, or torch.
+`guidance.py` has the opponents. Here they are flown, measured as a policy is, and printed. The policies' script flies
+the policies in its own processes, so this module imports neither a script nor torch.
+
 Reading order: policies, all on the same draws, table, command.
 """
 
@@ -44,7 +45,7 @@ from rocket.rescue import Failing, Known, directions_at, failing_optima, known_o
 from rocket.vehicle import Rocket
 
 POLICY_SCRIPT = Path(__file__).parents[1] / "ppo_gtrxl_rocket.py"
-PROCESSES = 2  # that solve, and policies flown at a time
+PROCESSES = 2  # processes that solve, and policies that are flown at a time
 KNOWLEDGE = {  # what each opponent has to know
     "replay": "optimum once",
     "tvlqr": "optimum and its gains once",
@@ -55,9 +56,9 @@ KNOWLEDGE = {  # what each opponent has to know
     "optimum": "the draw itself",
 }
 REPLANS = ("replan", "replan_measured", "replan_hint")
-# what flies once more behind a Kalman filter where navigation is noisy
+# with navigation noise these laws also fly by the estimates of a Kalman filter
 FILTERED = {f"{name}_filtered": name for name in ("tvlqr_energy", "replan", "replan_measured")}
-SOLVING = (*REPLANS, "replan_filtered", "replan_measured_filtered", "optimum")  # fly the first flights alone
+SOLVING = (*REPLANS, "replan_filtered", "replan_measured_filtered", "optimum")  # these fly only the first flights
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -66,7 +67,7 @@ SOLVING = (*REPLANS, "replan_filtered", "replan_measured_filtered", "optimum")  
 
 
 def knowledge(args: dict) -> str:
-    """What a policy has to know, by the arguments of its training; an older file's have fewer."""
+    """What a policy has to know, in words, by the arguments of its training. An older file has fewer arguments."""
     knows = "draws in training" if args.get("dispersion") else "the nominal flight in training"
     knows += ", the true mass" if args.get("observe_mass") else ""
     return knows + (", the draw itself" if args.get("observe_draw") else "")
@@ -78,9 +79,9 @@ def flag_words(value) -> str:
 
 
 def fly_checkpoint(path, dispersion: float, eval_seed: int, n: int, **options):
-    """A policy on the first n draws of a seed: the arrays of `evaluate_dispersed`, `knows` and `decision_us`.
+    """A policy on the first n draws of a seed: the arrays of `evaluate_dispersed`, and {`knows`, `decision_us`}.
 
-    BadInput with the script's own line where it refuses.
+    Raises BadInput with the script's own line if the script refuses the policy.
     """
     args = read_checkpoint(path, {}, flag="")["args"]
     with tempfile.TemporaryDirectory() as folder:
@@ -102,25 +103,37 @@ def fly_checkpoint(path, dispersion: float, eval_seed: int, n: int, **options):
 
 
 class Comparison:
-    """Policies and opponents on the first `n` draws of a seed; what solves for each flight on the first `solved`.
+    """Policies and opponents on the first `n` draws of a seed. Laws that solve for each flight fly the first `solved`.
 
-    `arrays`: by name, those of `evaluate_dispersed`; `about`: by name, `knows` and `decision_us`. `failures` are the
-    options `failure` and `failure_time` of the environment, or none: with them what is said of a competitor is of its
-    healthy flights, but for `failure_metrics`. `noise`: its option `navigation_noise`.
+    - `arrays`: {name: the arrays of `evaluate_dispersed`}
+    - `about`: {name: `knows` and `decision_us`}
+    - `failures`: the options `failure` and `failure_time` of the environment, or none; with them a competitor's metrics
+      are those of its healthy flights, except `failure_metrics`
+    - `noise`: the option `navigation_noise` of the environment
     """
 
     def __init__(self, env_id: str, dispersion: float, eval_seed: int, n: int, solved: int, noise=None, **failures):
-        self.env_id, self.rocket, self.dispersion = env_id, ROCKETS[env_id].rocket, dispersion
-        self.eval_seed, self.n, self.solved = eval_seed, n, solved
-        self.failures, self.failing = failures, Failing(dispersion, **failures)
+        self.env_id = env_id
+        self.rocket = ROCKETS[env_id].rocket
+        self.dispersion = dispersion
+        self.eval_seed = eval_seed
+        self.n = n
+        self.solved = solved
+        self.failures = failures
+        self.failing = Failing(dispersion, **failures)
         self.noise = checked_noise(noise)
-        self.options = failures | ({"navigation_noise": self.noise} if self.noise else {})
+        self.options = dict(failures)
+        if self.noise:
+            self.options["navigation_noise"] = self.noise
         self.arrays, self.about, self.optima = {}, {}, []
 
     def fly_policies(self, checkpoints: dict):
-        """Fly the policies of these files, name -> agent.safetensors; ValueError where one flew other draws."""
+        """Fly the policies of {name: agent.safetensors}. Raises ValueError if one flew other draws."""
         z = self.draws(self.n)
-        fly = lambda path: fly_checkpoint(path, self.dispersion, self.eval_seed, self.n, **self.options)  # noqa: E731
+
+        def fly(path):
+            return fly_checkpoint(path, self.dispersion, self.eval_seed, self.n, **self.options)
+
         with ThreadPoolExecutor(PROCESSES) as pool:  # each thread waits for a process
             for name, flown in zip(checkpoints, pool.map(fly, checkpoints.values())):
                 if not np.array_equal(flown[0]["draw"], z):
@@ -153,9 +166,9 @@ class Comparison:
         return draws(self.rocket, self.dispersion, self.eval_seed, n, self.failing.failure)
 
     def fly(self, name: str, opponent, n: int):
-        """Fly an opponent on the first n draws; what solves tells the time of its decisions itself.
+        """Fly an opponent on the first n draws, and time its decisions unless it solves.
 
-        What was made for the first `solved` flights flies them in one batch.
+        An opponent that solves is made for the first `solved` flights, so it flies them in one batch.
         """
         at_once = n if name in SOLVING else AT_ONCE
         _, self.arrays[name] = evaluate_dispersed(
@@ -168,12 +181,12 @@ class Comparison:
             self.about[name]["decision_us"] = decision_us(self.env_id, opponent)
 
     def behind_filter(self, law):
-        """The law by the estimates of a Kalman filter."""
+        """The same law, which then flies by the estimates of a Kalman filter."""
         assert self.noise is not None
         return Filtered(law, self.env_id, self.noise, self.dispersion)
 
     def replan(self, name: str, exhaust):
-        """Fly `Replanning` on the first flights."""
+        """Fly `Replanning` on the first flights, and note the number and time of its solves."""
         velocity_noise = self.noise[1] if self.noise else 0.0
         with guidance.Replanning(self.env_id, PROCESSES, exhaust, velocity_noise) as replanning:
             law = self.behind_filter(replanning) if name in FILTERED else replanning
@@ -183,10 +196,10 @@ class Comparison:
             self.about[name]["decision_us"] = 1e6 * float(np.median(replanning.seconds))
 
     def solve(self, reached=None) -> list:
-        """The optima that know the draws of the first flights, to the target or to the orbits of `reached`.
+        """The optima that know the draws of the first flights, to the target or to the orbits of the states `reached`.
 
-        `reached`: states (n, 7), competitor by competitor; solved in one go, since processes take seconds to start.
-        Of flights with a failure none is solved: None.
+        `reached` (n, 7) has the competitors one after another. They are solved in one go, because processes take
+        seconds to start. A flight with a failure has no optimum here, but None.
         """
         z = self.draws(self.solved)
         if reached is not None:
@@ -204,7 +217,7 @@ class Comparison:
         return draw_vehicles(self.rocket, self.dispersion, z, self.failing.failure, self.failing.failure_time)
 
     def metrics(self, name: str, n: int) -> dict:
-        """The metrics of a competitor's first n flights, or of all where it flew fewer."""
+        """The metrics of a competitor's first n flights, or of all its flights if it flew fewer."""
         arrays = {key: value[:n] for key, value in self.arrays[name].items()}
         flights = recorded_flights(chosen(arrays, healthy(arrays)), self.rocket, self.dispersion)
         starts = len(flights["error_norm"])
@@ -216,24 +229,28 @@ class Comparison:
         return metrics
 
     def known(self) -> Known:
-        """What the optima leave that know of a failure from its strike on."""
+        """What is left by the optima that know of a failure from its strike on."""
         return known_optima(self.env_id, ROCKETS[self.env_id], self.failing, self.eval_seed, self.n)
 
     def best(self) -> Known:
-        """`known`, and of the healthy ones among the first flights what their own optimum leaves."""
+        """`known`, where the healthy flights among the first ones have what their own optimum leaves."""
         known = Known(*(values.copy() for values in self.known()))
         is_healthy = self.vehicles(self.draws(self.solved)).failure[0] < 0
         for k in np.flatnonzero(is_healthy):
-            if optimum := self.optima[k]:
-                known.mass[k], known.price[k] = optimum["final_mass"], optimum["orbit_price"]
+            optimum = self.optima[k]
+            if optimum:
+                known.mass[k] = optimum["final_mass"]
+                known.price[k] = optimum["orbit_price"]
         return known
 
     def flights_by_loss(self) -> dict:
         """The arrays of opponents.npz: each flight's failure, what could be saved of it, and how each competitor ended.
 
-        `failure` (n, 3), `best_mass_kg` (n,), what the optimum leaves that knows of it (NaN of the healthy flights but
-        the first ones), and `dry_mass_kg` (n,); of each competitor's flights, the first ones, `<name>_error_norm`,
-        `<name>_final_mass_kg` and `<name>_mass_reached_kg`, what the same optimum leaves in the orbit reached.
+        - `failure` (n, 3) and `dry_mass_kg` (n,)
+        - `best_mass_kg` (n,): what the optimum leaves that knows of the failure; NaN for healthy flights beyond the
+          first `solved`
+        - `<name>_error_norm` and `<name>_final_mass_kg` of each competitor's flights, which are the first ones
+        - `<name>_mass_reached_kg`: what the same optimum leaves in the orbit that the competitor reached
         """
         vehicles, best = self.vehicles(self.draws(self.n)), self.best()
         arrays = {"failure": vehicles.failure.T, "best_mass_kg": best.mass, "dry_mass_kg": vehicles.dry_mass}
@@ -247,9 +264,10 @@ class Comparison:
     def shares(self, name: str, reached: list) -> dict:
         """A competitor's mass over that of the optimum that knows the draw: to the target, and to the orbit `reached`.
 
-        Of those of the first flights that are successes and whose optimum was found.
+        The flights are those of the first `solved` that are a success and whose optimum was found.
         """
-        ends, shares = {key: value[: self.solved] for key, value in self.arrays[name].items()}, {}
+        ends = {key: value[: self.solved] for key, value in self.arrays[name].items()}
+        shares = {}
         success = (np.linalg.norm(ends["final_error"], axis=1) < SUCCESS) & healthy(ends)
         for key, optima in (("target", self.optima), ("reached", reached)):
             mass = np.array([optimum["final_mass"] if optimum else np.nan for optimum in optima])
@@ -260,7 +278,7 @@ class Comparison:
         return shares
 
     def report(self) -> dict:
-        """What opponents.json holds: of each its metrics, those of its first flights (`first`), and `shares`."""
+        """What opponents.json holds: each competitor's metrics, those of its first flights (`first`), and `shares`."""
         report = {"env_id": self.env_id, "dispersion": self.dispersion, "eval_seed": self.eval_seed} | self.failures
         report |= noise_metrics(self.noise)
         is_healthy = self.vehicles(self.draws(self.solved)).failure[0] < 0
@@ -280,8 +298,9 @@ class Comparison:
 
 
 def recorded_flights(arrays: dict, rocket: Rocket, dispersion: float) -> dict:
-    """What `dispersed_metrics` reads, of flights (n,) as eval.npz has them."""
-    y, burn_out = arrays["final_y"], draw_vehicles(rocket, dispersion, arrays["draw"]).burn_out
+    """The flights (n,) of eval.npz's arrays, in the form that `dispersed_metrics` reads."""
+    y = arrays["final_y"]
+    burn_out = draw_vehicles(rocket, dispersion, arrays["draw"]).burn_out
     flights = final_elements(y, rocket) | {"final_mass_kg": y[:, 6]}
     flights |= {
         "error_norm": np.linalg.norm(arrays["final_error"], axis=1),
@@ -301,8 +320,9 @@ WHEN = {"random": "from a random moment of a burn on", "ignition": "from the las
 
 
 def table(report: dict) -> str:
-    """opponents.json as a table: a line a competitor, then the first flights of those that flew more."""
-    competitors, known = report["laws"], report["bound_flights"]
+    """opponents.json as a table: a line for each competitor, then one for the first flights of each that flew more."""
+    competitors = report["laws"]
+    known = report["bound_flights"]
     fewest = min(entry["dispersed_starts"] for entry in competitors.values())
     about = " healthy flights of" if "failure" in report else ""
     rows = [("", *COLUMNS)]
@@ -327,14 +347,14 @@ def table(report: dict) -> str:
 
 
 def noise_words(report: dict) -> str:
-    """The noise of navigation in words, " ... ,"; none where there is none."""
+    """The navigation noise in words, " ... ,"; empty without noise."""
     if "navigation_noise_m" not in report:
         return ""
     return f" seen with a noise of {report['navigation_noise_m']:g} m and {report['navigation_noise_m_s']:g} m/s,"
 
 
 def failure_lines(report: dict) -> list[str]:
-    """The table of the flights with a failure, a line a competitor; none where there are none."""
+    """The table of the flights with a failure, a line for each competitor; no lines without failures."""
     if "failure" not in report:
         return []
     when = WHEN[report["failure_time"]]
@@ -358,7 +378,7 @@ def failure_lines(report: dict) -> list[str]:
 
 
 def share(entry: dict, name: str, known: int) -> str:
-    """A competitor's share of the optima's mass, with the number of its flights where they are not all `known` ones."""
+    """A competitor's share of the optima's mass, and the number of its flights in brackets if it is not `known`."""
     if f"share_{name}_mean" not in entry:
         return "-"
     flights = entry[f"share_{name}_flights"]
@@ -366,9 +386,9 @@ def share(entry: dict, name: str, known: int) -> str:
 
 
 def cells(entry: dict, metrics: dict, known: int) -> list[str]:
-    """A competitor's cells: those of its `metrics`, then what does not depend on how many flights they are of.
+    """A competitor's cells: those of its `metrics`, then those that do not depend on the number of flights.
 
-    known: how many flights have an optimum that knows their draw.
+    known is the number of flights that have an optimum which knows their draw.
     """
     errors = [f"{metrics[f'dispersed_error_{name}']:.6f}" for name in ("median", "p95", "max")]
     perigee = [metrics.get(f"dispersed_perigee_error_{part}_km") for part in ("mean", "std")]
@@ -388,7 +408,7 @@ def cells(entry: dict, metrics: dict, known: int) -> list[str]:
 
 
 def duration(microseconds: float | None) -> str:
-    """A time in the unit that suits it; "-" where nothing is decided in flight."""
+    """A time in µs or ms; "-" if nothing is decided in flight."""
     if microseconds is None:
         return "-"
     return f"{microseconds:.0f} µs" if microseconds < 5000 else f"{microseconds / 1000:.0f} ms"
@@ -400,7 +420,7 @@ def duration(microseconds: float | None) -> str:
 
 
 def check(env_id: str, folder: Path, n: int, solved: int, checkpoints: dict):
-    """BadInput, before anything is flown, where the flags do not fit a results folder of this id."""
+    """Raise BadInput before anything is flown, if the flags do not fit a results folder of this id."""
     refuse_unless(ROCKETS[env_id].cutoff, f"the env_id of {folder}", env_id, "must be a rocket's with cut-off")
     refuse_unless(solved <= n, "--solved", solved, f"must be at most {n}, as --starts is")
     for path in checkpoints.values():
@@ -421,10 +441,10 @@ def compare(
     failure_time: str = "random",
     navigation_noise=None,
 ):
-    """Compare a results folder's policy, and those of `also` (name, path), with all opponents; print and write it.
+    """Compare a results folder's policy, and those of `also` (name, path), with all opponents. Print and write it.
 
-    opponents.json and figures/opponents.png, with failures also opponents.npz (`flights_by_loss`) and
-    figures/opponents_by_loss.png, are written when all is flown. OSError or ValueError says what is bad.
+    When all is flown, opponents.json and figures/opponents.png are written. With failures opponents.npz
+    (`flights_by_loss`) and figures/opponents_by_loss.png are written, too. Raises OSError or ValueError for bad input.
     """
     check_failure(failure, failure_time, ROCKETS[env_id].cutoff)
     noise = checked_noise(navigation_noise)
@@ -438,7 +458,8 @@ def compare(
     comparison = Comparison(env_id, dispersion, eval_seed, n, solved, noise, **failures)
     comparison.fly_policies(checkpoints)
     comparison.fly_opponents()
-    report, labelled = comparison.report(), {}
+    report = comparison.report()
+    labelled = {}
     for name, entry in report["laws"].items():
         label = f"{name}: {entry['dispersed_box_rate']:.1%} of {entry['dispersed_starts']}"
         arrays = comparison.arrays[name]

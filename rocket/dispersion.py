@@ -1,4 +1,8 @@
-"""What differs from flight to flight: a draw is a vector of standard scores, in the order of `draw_names`."""
+"""What differs from flight to flight.
+
+A draw is a vector of k standard scores in the order of `draw_names`. Reading order: the standard deviations, the
+vehicles, the scores, the vehicles of draws, ends of burns, wind, which rockets can be drawn.
+"""
 
 from __future__ import annotations
 
@@ -15,54 +19,54 @@ from rocket.vehicle import ROCKET, Rocket, engine_groups, engine_types
 
 @dataclass(frozen=True)
 class Dispersion:
-    """Standard deviations of a flight's differences from the table: relative ones, kg and m/s.
+    """Standard deviations of a flight's differences from the table: relative, in kg or in m/s.
 
-    The studies named are quoted from memory and were not looked up again; "ours" is nobody else's number. A public
-    Monte-Carlo study of launch guidance has thrust 1 %, Isp 0.3 %, propellant and dry mass 0.5 %, density 5 %; one of
-    the Saturn V with 10 000 trials Isp 0.3 %, thrust 0.4 %.
+    We quote two studies from memory and did not look them up again. Study A, a public Monte-Carlo study of launch
+    guidance, has thrust 1 %, Isp 0.3 %, propellant and dry mass 0.5 %, density 5 %. Study B, of the Saturn V with
+    10 000 trials, has Isp 0.3 % and thrust 0.4 %. "Our choice" has no source.
     """
 
-    burn_rate: float = 0.005  # thrust and flow together: between the studies' 0.4 % and 1 %
-    isp: float = 0.003  # thrust at a given flow: both studies'
-    propellant: float = 0.003  # load: ours, below the study's 0.5 %, for the burn rate moves the burn-out, too
-    dry_mass: float = 0.005  # the study's
-    payload: float = 20.0  # kg: ours, the study's 0.5 % of the paper's payload
-    drag: float = 0.14  # density times Cd: the study's 5 % of density and, ours, 13 % of Cd
-    wind: float = 20.0  # m/s at its altitude, east and north each: ours, the jet stream from day to day
+    burn_rate: float = 0.005  # of thrust and flow together; between the thrusts of B and A
+    isp: float = 0.003  # of the thrust at a given flow; A and B
+    propellant: float = 0.003  # of the load; our choice, below A's 0.5 % because the burn rate moves the burn-out, too
+    dry_mass: float = 0.005  # A
+    payload: float = 20.0  # kg; our choice, A's 0.5 % of the paper's payload
+    drag: float = 0.14  # of density times Cd; A's 5 % of density, and 13 % of Cd by our choice
+    wind: float = 20.0  # m/s at its altitude, east and north each; our choice, the jet stream from day to day
 
 
 DISPERSION = Dispersion()
 OF_ENGINES = ("burn_rate", "isp", "propellant", "dry_mass")  # one score each for every type of engine
 OF_FLIGHT = ("payload", "drag", "wind_east", "wind_north")
 LARGEST_SCORE = 3.0  # drawn scores are clipped there
-LARGEST_CHANGE = 0.9  # part of its nominal value by which a drawn factor or payload may differ: nothing vanishes
+LARGEST_CHANGE = 0.9  # the largest relative change of a drawn factor or payload, so that none reaches zero
 LARGEST_DISPERSION = 100.0
-WIND_ALTITUDE, WIND_DEPTH = 12e3, 5e3  # m, of the profile exp(-((h - altitude) / depth)^2): ours
+WIND_ALTITUDE, WIND_DEPTH = 12e3, 5e3  # m, of the profile exp(-((h - altitude) / depth)^2), which is our choice
 
 
 class Vehicles(NamedTuple):
-    """N vehicles as they were drawn, arcs as in `Rocket.arcs` (A of them): what is constant between events.
+    """N drawn vehicles. An arc is a time between two events, as in `Rocket.arcs`; there are A arcs.
 
-    Where failures are drawn there is one arc more: the strike cuts a burn in two, that of a healthy flight never comes.
+    With failures there is one more arc, because the strike cuts a burn in two. A healthy flight never comes to it.
     """
 
     mass: np.ndarray  # (N,) kg at lift-off
     dry_mass: np.ndarray  # (N,) kg, as `Rocket.dry_mass`
     propellant: np.ndarray  # (N,) kg in the last stage
-    burn_end: np.ndarray  # (burns, N) s, of the last when it runs dry
+    burn_end: np.ndarray  # (burns, N) s; the last burn ends when it runs dry
     burn: np.ndarray  # (A, N) the burn of each arc, from 0
     end: np.ndarray  # (A, N) s, the last infinite
     thrust: np.ndarray  # (A, N) N
     flow: np.ndarray  # (A, N) kg/s
     dropped: np.ndarray  # (A, N) kg at the arc's end
-    burn_out: np.ndarray  # (N,) s: when the last stage has burnt what the nominal one burns, or runs dry
-    wind: np.ndarray  # (2, N) m/s, towards east and north where the profile of `wind_velocity` is 1
+    burn_out: np.ndarray  # (N,) s, when the last stage has burnt as much as nominally, or runs dry
+    wind: np.ndarray  # (2, N) m/s towards east and north, where the profile of `wind_velocity` is 1
     drag: np.ndarray  # (N,) factor on the drag
-    failure: np.ndarray  # (3, N) burn, moment (s) and share lost; of a healthy flight -1, 0, 0
+    failure: np.ndarray  # (3, N) burn, moment (s) and share lost; -1, 0, 0 for a healthy flight
 
 
 def draw_names(rocket: Rocket) -> tuple[str, ...]:
-    """What the k scores of a draw are of; types of engines are counted from 1."""
+    """The names of the k scores of a draw. Types of engines are counted from 1."""
     types = range(1, len(engine_types(rocket)) + 1)
     return (*(f"{name}_{j}" for name in OF_ENGINES for j in types), *OF_FLIGHT)
 
@@ -71,13 +75,14 @@ DRAW = draw_names(ROCKET)
 
 
 def draw_sigmas(rocket: Rocket) -> np.ndarray:
-    """(k,): the entry of `DISPERSION` for each score."""
+    """The entry of `DISPERSION` for each score, (k,)."""
     table = {**vars(DISPERSION), "wind_east": DISPERSION.wind, "wind_north": DISPERSION.wind}
-    return np.array([table[name if name in table else name.rpartition("_")[0]] for name in draw_names(rocket)])
+    kinds = [name if name in table else name.rpartition("_")[0] for name in draw_names(rocket)]
+    return np.array([table[kind] for kind in kinds])
 
 
 def draw_bounds(rocket: Rocket, dispersion: float) -> np.ndarray:
-    """(k,): the largest score that is drawn: 3, less where a factor or the payload would change by more than 90 %."""
+    """The largest scores (k,) that are drawn: 3, or less if a factor or the payload would change by more than 90 %."""
     nominal = np.ones(len(draw_names(rocket)))
     nominal[-4:] = rocket.payload, 1.0, np.inf, np.inf
     sigmas = dispersion * draw_sigmas(rocket)
@@ -86,13 +91,15 @@ def draw_bounds(rocket: Rocket, dispersion: float) -> np.ndarray:
 
 
 def largest_draw(rocket: Rocket, dispersion: float, failure_time: str = "") -> np.ndarray:
-    """(1, k): the draw of the vehicle that burns longest and is heaviest.
+    """The draw (1, k) of the vehicle that burns longest and is heaviest.
 
-    With a `failure_time` (F, k + 4), one of which burns longest: a row for each group of engines that may fail.
+    With a `failure_time` the draws are (F, k + 4), a row for each group of engines that may fail. One of these vehicles
+    burns longest.
     """
     types = len(engine_types(rocket))
     signs = np.zeros(len(draw_names(rocket)))
-    signs[:types], signs[2 * types : 4 * types + 1] = -1.0, 1.0
+    signs[:types] = -1.0
+    signs[2 * types : 4 * types + 1] = 1.0
     largest = (signs * draw_bounds(rocket, dispersion))[None]
     if not failure_time:
         return largest
@@ -101,7 +108,7 @@ def largest_draw(rocket: Rocket, dispersion: float, failure_time: str = "") -> n
 
 
 class Factors(NamedTuple):
-    """What the draws make of the nominal values; the first four by type of engine, (types, N) each."""
+    """What the draws make of the nominal values. The first four are by type of engine, (types, N) each."""
 
     burn_rate: np.ndarray
     isp: np.ndarray
@@ -113,7 +120,7 @@ class Factors(NamedTuple):
 
 
 def draw_factors(rocket: Rocket, dispersion: float, draw: np.ndarray) -> Factors:
-    """The factors of scores (N, k). Raises BadInput for the first score that no vehicle can have."""
+    """The factors that scores (N, k) give. Raises BadInput for the first score that no vehicle can have."""
     types = len(engine_types(rocket))
     change = dispersion * draw_sigmas(rocket)[:, None] * draw.T
     value = change + 1.0
@@ -133,11 +140,11 @@ def draw_factors(rocket: Rocket, dispersion: float, draw: np.ndarray) -> Factors
 def draw_vehicles(
     rocket: Rocket, dispersion: float, draw: np.ndarray, failure: float = 0.0, failure_time: str = "random"
 ) -> Vehicles:
-    """The vehicles of N draws (N, k): each value is the nominal one changed by dispersion times sigma times score.
+    """The vehicles of N draws (N, k). Each value is the nominal one changed by dispersion times sigma times score.
 
-    Arcs are the burns, and a last one without thrust. What is loaded is burnt or dropped, also what an engine keeps
-    that uses a part of its propellant. With a `failure` a draw may be (N, k + 4), the last four as in `FAILURE_DRAW`;
-    without them a flight is healthy. Raises BadInput for a draw that no vehicle can have.
+    The arcs are the burns, and a last arc without thrust. All propellant is burnt or dropped, also what an engine does
+    not burn. With a `failure` draws may be (N, k + 4), where the last four numbers are those of `FAILURE_DRAW`. Without
+    them the flights are healthy. Raises BadInput for a draw that no vehicle can have.
     """
     draw = np.asarray(draw, dtype=np.float64)
     scores = len(draw_names(rocket))
@@ -197,15 +204,16 @@ def draw_vehicles(
 
 
 def struck(vehicles: Vehicles, groups, losses: Losses, strike: np.ndarray, thrust: np.ndarray, flow: np.ndarray):
-    """Healthy vehicles whose burns are cut where a failure strikes (N,) s, with the thrust and flow that are left.
+    """The vehicles after failures: their burns are cut at the `strike` (N,) s, and then have the thrust and flow left.
 
-    thrust, flow (G, N): those of each group of engines. A strike that is infinite never comes.
+    vehicles are the healthy ones. thrust and flow (G, N) are those of each group of engines. An infinite strike never
+    comes.
     """
     last_arc = len(vehicles.end) - 1
     cut = (vehicles.end <= strike).sum(axis=0)  # the arc that the strike ends
     arcs = np.arange(last_arc + 2)[:, None]
     after = arcs > cut
-    source = np.minimum(arcs - after, last_arc)  # which of the healthy flight's arcs it is of
+    source = np.minimum(arcs - after, last_arc)  # the healthy flight's arc that each arc is part of
 
     def of_arcs(column):
         return np.take_along_axis(column, source, axis=0)
@@ -229,19 +237,24 @@ def struck(vehicles: Vehicles, groups, losses: Losses, strike: np.ndarray, thrus
 
 
 def arc_burns(rocket: Rocket, arcs: int) -> np.ndarray:
-    """The burn of each arc (arcs,): what follows the last burn counts as part of it."""
+    """The burn of each arc (arcs,). What follows the last burn counts as part of it."""
     return np.minimum(np.arange(arcs), len(rocket.burns) - 1)
 
 
 def burn_ends(rocket: Rocket, lasting: np.ndarray, losses: Losses):
-    """Ends of the burns (B, N) s, the last one's when it runs dry; `burn_out` (N,) s; seconds lit of the groups (G, N).
+    """The ends of the burns (B, N) s, `burn_out` (N,) s, and the seconds (G, N) that the groups of engines are lit.
 
-    lasting (types, N): how long an engine's propellant lasts, as a part of the nominal time. A burn that drops burning
-    engines ends when the first of them has burnt as large a part of its propellant as nominally, a coast
-    after its nominal length, any other at its nominal time, and none goes on without an engine's propellant. Engines
-    that lose thrust and flow burn the same for longer.
+    lasting (types, N) is how long an engine's propellant lasts, as a part of the nominal time.
+
+    - a burn that drops burning engines ends when the first of them has burnt its nominal part of its propellant
+    - a coast ends after its nominal length
+    - any other burn ends at its nominal time
+    - no burn goes on without the propellant of one of its engines, and the last burn goes on until then
+
+    Engines that lose thrust and flow burn the same propellant for longer.
     """
-    groups, last = engine_groups(rocket), len(rocket.burns) - 1
+    groups = engine_groups(rocket)
+    last = len(rocket.burns) - 1
     start = burn_out = np.zeros(lasting.shape[1])
     seconds_lit = np.zeros((len(groups), lasting.shape[1]))
     ends = []
@@ -260,9 +273,10 @@ def burn_ends(rocket: Rocket, lasting: np.ndarray, losses: Losses):
 
 
 def seconds_left(groups, k: int, lasting: np.ndarray, seconds_lit: np.ndarray, losses: Losses):
-    """From the beginning of burn k on: s until the first engine is empty, and until the first that leaves then is due.
+    """Two times (N,) in s from the beginning of burn k on; infinite if there is none.
 
-    (N,) each, infinite where there is none. An engine is due when it has burnt its nominal part of its propellant.
+    - until the first of its engines is empty
+    - until the first engine that leaves after it is due, which is when it has burnt its nominal part of its propellant
     """
     until_empty = until_due = np.full(lasting.shape[1], np.inf)
     for g, (group, seconds) in enumerate(zip(groups, seconds_lit)):
@@ -275,7 +289,7 @@ def seconds_left(groups, k: int, lasting: np.ndarray, seconds_lit: np.ndarray, l
 
 
 def nominal_vehicles(rocket: Rocket, number: int) -> Vehicles:
-    """`number` vehicles just as the table has them; what a stage has not burnt (`table_isp`) stays on board."""
+    """`number` vehicles as the table has them. With `table_isp` propellant that a stage has not burnt stays aboard."""
     _, end, thrust, flow, dropped = np.array(rocket.arcs()).T
     values = {
         "mass": rocket.x0[6],
@@ -297,10 +311,13 @@ def nominal_vehicles(rocket: Rocket, number: int) -> Vehicles:
 
 
 def wind_velocity(place, wind, rocket: Rocket = ROCKET):
-    """The wind in ECI, m/s by components, at (rx, ry, rz, |r|) in m; wind: (east, north) where the profile is 1."""
+    """The wind in ECI, m/s by components, at the place (rx, ry, rz, |r|) in m.
+
+    wind is (east, north) in m/s where the profile over the altitude is 1.
+    """
     rx, ry, rz, r = place
     profile = exp(-(((r - (rocket.Re + WIND_ALTITUDE)) / WIND_DEPTH) ** 2))
-    axis = (rx * rx + ry * ry) ** 0.5 + 1e-9  # m from the Earth's axis; over a pole nothing is east, nor NaN
+    axis = (rx * rx + ry * ry) ** 0.5 + 1e-9  # m from the Earth's axis; never 0, so that a pole gives no NaN
     east, north = profile * wind[0] / axis, profile * wind[1] / r
     south = north * rz / axis
     return -east * ry - south * rx, east * rx - south * ry, north * axis
@@ -310,14 +327,15 @@ NAMES = "; engines of equal numbers that are lit at other times need a `name` of
 
 
 def check_drawable(rocket: Rocket):
-    """BadInput where no flights can be drawn of a rocket: with all scores 0 it has to be the nominal one.
+    """Raise BadInput for a rocket of which no flights can be drawn: with all scores 0 they must be the nominal ones.
 
-    Drawn engines burn each from a tank of its own, and those that are dropped together burn together.
+    Each drawn engine burns from its own tank, and engines that are dropped together burn together.
     """
     drawn = draw_vehicles(rocket, 1.0, np.zeros((1, len(draw_names(rocket)))))
     last = len(rocket.burns) - 1
     for k, (burn, dropped) in enumerate(zip(rocket.burns, rocket.jettison)):
-        ends, leaves = drawn.end[k, 0], drawn.dropped[k, 0]
+        ends = drawn.end[k, 0]
+        leaves = drawn.dropped[k, 0]
         same = np.isclose(burn.end, ends) or (k == last and (ends > burn.end or rocket.table_isp))
         allowed = f"cannot be drawn: its engines, each from its own tank, burn until {ends:.6g} s{NAMES}"
         refuse_unless(same, f"burns[{k}].end", burn.end, allowed)

@@ -1,4 +1,4 @@
-"""Equations of motion: x is a tuple of components, NumPy arrays over environments, CasADi symbols or torch tensors."""
+"""Equations of motion. Components are NumPy arrays over environments, CasADi symbols or torch tensors."""
 
 from __future__ import annotations
 
@@ -11,18 +11,22 @@ def ascent_dynamics(x, u, rocket: Rocket = ROCKET, wind=None, drag_factor=None):
     """r' = v, v' = -mu r / |r|^3 + T u / m + D / m, m' = -flow ("Multiphase Rocket Ascent Problem").
 
     D = -1/2 rho Cd S |v_rel| v_rel, rho = rho0 exp(-h / H), v_rel = v - omega_e x r. The paper's drag acts "during
-    atmospheric phases", this one always: it fades with the density.
+    atmospheric phases". This drag acts always, and fades with the density.
 
-    x: position r (m), velocity v (m/s), both in ECI, and mass m (kg), by components. u: the unit thrust direction in
-    ECI by components, thrust T (N) and propellant flow (kg/s). wind (east, north; m/s where its profile over the
-    altitude is 1) is taken from v_rel; drag_factor multiplies D. Returns the time derivative of x, by components.
+    - x: the components of position r (m) and velocity v (m/s), both in ECI, and the mass m (kg)
+    - u: the components of the unit thrust direction in ECI, the thrust T (N) and the propellant flow (kg/s)
+    - wind: (east, north) in m/s where its profile over the altitude is 1; it is subtracted from v_rel
+    - drag_factor: multiplies D
+
+    Returns the time derivative of x, by components.
     """
     rx, ry, rz, vx, vy, vz, m = x
     ux, uy, uz, thrust, flow = u
     r2 = rx * rx + ry * ry + rz * rz
     r = r2**0.5
-    gravity, push = -rocket.mu / (r2 * r), thrust / m
-    # v_rel, with the wind's velocity taken off below
+    gravity = -rocket.mu / (r2 * r)
+    push = thrust / m
+    # v_rel, from which the wind is subtracted below
     relative_x = vx + rocket.omega_e * ry
     relative_y = vy - rocket.omega_e * rx
     relative_z = vz

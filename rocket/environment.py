@@ -1,4 +1,8 @@
-"""The rockets' environment: time grid, events, RK4, cut-off, vehicles that differ; and how an id is registered."""
+"""The rockets' environment, and how an id is registered.
+
+Reading order: the steps, the batched environment (draws, observations, flight between events, cut-off, reward), the
+single environment, one recorded flight, registration.
+"""
 
 from __future__ import annotations
 
@@ -53,77 +57,89 @@ from rocket.rewards import (
 from rocket.vehicle import Rocket, delta_v
 
 ACTION_FRAMES = ("eci", "local")
-STIFF = 0.25  # drag's derivative by the speed, rho Cd S |v| / m, times the step: from here on a step is cut
+STIFF = 0.25  # a step is cut where rho Cd S |v| / m times the step, drag's derivative by the speed, exceeds this
 
 
 class Schedule(NamedTuple):
-    """When steps are flown, (N,) each."""
+    """When the N running steps are flown, (N,) each."""
 
     begin: np.ndarray  # s
     end: np.ndarray  # s
     phi: np.ndarray  # the phase before the step, 0 to 1
-    arc: np.ndarray  # in which the step begins, an index of `Vehicles`' arcs
+    arc: np.ndarray  # the arc in which the step begins, an index of the arcs of `Vehicles`
 
 
 class Steps(NamedTuple):
     """The steps that n environments are flying."""
 
-    u: np.ndarray  # (3, n) thrust directions in ECI, held
-    begin: np.ndarray  # (n,) s: of the step, or of the arc that has begun within it
-    end: np.ndarray  # (n,) s, of the whole step
-    who: np.ndarray  # (n,) the environments
+    u: np.ndarray  # (3, n) thrust directions in ECI, held over the step
+    begin: np.ndarray  # (n,) s, when the step begins, or the arc that begins within it
+    end: np.ndarray  # (n,) s, when the whole step ends
+    who: np.ndarray  # (n,) the environments' indices
     arc: np.ndarray  # (n,) the arc at `begin`
 
     def of(self, chosen) -> Steps:
-        """Those of some of them."""
+        """The steps of the chosen environments, indices or a mask of n."""
         return Steps(*(column[..., chosen] for column in self))
 
 
 class RocketVectorEnv(BatchedEnv):
-    """N launches of a mission's rocket into its orbit, steered by the thrust direction; 2 s steps, exact events.
+    """N launches of a mission's rocket into its orbit, steered by the thrust direction, in steps of 2 s.
 
-    Observation: [r (3) m, v (3) m/s, m kg, t_norm, phi] in ECI, t_norm = 1 - t / rocket.end_time (961 s), phi in 0 to 1
-    the phase at the step's start (the paper's 0 to 3, over 3; a burn is a phase). Action: the thrust direction, any
-    length but 0 (BadInput), normalised here; with `action_frame="local"` by (up, along-track, cross-track of the target
-    plane) at the step's start, then held in ECI. A step is one RK4 step between events: staging, a stage that runs dry
-    (`table_isp`), the end of the episode.
+    Observation: [r (3) m, v (3) m/s, m kg, t_norm, phi], r and v in ECI. t_norm is 1 - t / rocket.end_time (961 s). phi
+    is the phase at the step's start, from 0 to 1 (the paper counts 0 to 3). A burn is a phase.
 
-    With `dispersion` D > 0 each group of `flights_per_start` episodes draws its k standard scores, clipped at +-3 (see
-    `draw_bounds`), in the order of `draw_names`, and flies the vehicle of `draw_vehicles`, D times `DISPERSION` from
-    the nominal one. `reset(options={"draw": z})`, z (N, k), gives them, also beyond 3; BadInput refuses what no vehicle
-    can be. Events and phases are then each flight's own. The mass that is observed is the flight computer's: the
-    nominal schedule from the last staging on; `observe_mass` shows the true one. `observe_draw` puts the scores behind
-    the nine.
+    Action: the thrust direction, of any length but 0, which raises BadInput. It is normalised here and held in ECI over
+    the step. With `action_frame="local"` its components are up, along-track and cross-track of the target plane, at the
+    step's start.
 
-    With `failure` K > 0 (cut-off alone) half of the episodes have a hidden loss of thrust: one group of engines loses a
-    share of thrust and flow, uniform from 0 to K, from a uniformly random moment of its burn on, or with `failure_time`
-    "ignition" the last stage from its ignition on (`failure.py`). A draw then has four numbers more, from 0 to 1, named
-    by `FAILURE_DRAW`; one of k scores alone is a healthy flight's. No observation shows them.
+    A step is one RK4 step between two events. Events are staging, a stage that runs dry (`table_isp`) and the end of
+    the episode. They are met exactly.
 
-    With `navigation_noise` (m, m/s) the observed r and v are off by normal numbers of these standard deviations, drawn
-    afresh for each component and step. The state itself, events, cut-off and rewards are exact. The noise has a stream
-    of its own: draws stay as they are without it. `reset(options={"noise": w})`, w (N, T, 6) standard scores of
-    `episode_steps` + 1 or more observations, gives it.
+    With `dispersion` D > 0 flights differ. Each group of `flights_per_start` episodes draws k standard scores in the
+    order of `draw_names`, clipped at +-3 (`draw_bounds`). It flies the vehicle of `draw_vehicles`, which differs from
+    the nominal one by D times `DISPERSION`. Each flight has its own events and phases. The observed mass is the flight
+    computer's, which follows the nominal schedule from the last staging on. `observe_mass` shows the true mass.
+    `observe_draw` adds the scores behind the nine numbers. `reset(options={"draw": z})` gives the scores z (N, k), also
+    beyond 3. It raises BadInput for a vehicle that cannot be.
 
-    With a `cutoff` mission (ours: the paper fixes the final time) the engine stops when, in the last phase, the energy
-    reaches the target's: the root within the step, to 1e-10, ends the episode.
+    With `failure` K > 0, for missions with cut-off, half of the episodes have a hidden loss of thrust (`failure.py`).
+    One group of engines loses a share of thrust and flow. The share is uniform from 0 to K, and the loss begins at a
+    uniformly random moment of the group's burn. With `failure_time` "ignition" the last stage loses it from its
+    ignition on. A draw then has four more numbers from 0 to 1, which `FAILURE_DRAW` names. A draw of k scores alone is
+    a healthy flight's. No observation shows the failure.
 
-    Every flight also ends below altitude 0 (a crash), and at `end_time`. With cut-off, and dispersion or failures, the
-    burn-out of its own last stage takes the place of `end_time` (t_norm may end below 0), unless `end_time` was changed
-    or is not the last burn's end.
+    With `navigation_noise` (m, m/s) normal numbers of these standard deviations are added to the observed r and v, new
+    ones for each component and step. The state, events, cut-off and rewards stay exact. The noise has its own random
+    stream, so the draws are the same without it. `reset(options={"noise": w})` gives the standard scores w (N, T, 6) of
+    `episode_steps` + 1 or more observations.
 
-    Reward: the sum of the five parts R_orbital, R_trajectory, R_guidance, R_penalties and R_terminal, each a function
-    of `rewards.py`. `final_info`, (N,) each: `error_norm` (and `error` (N, 6), the terminal error in ECI), `a_km e
-    i_deg raan_deg argp_deg final_mass_kg final_time_s max_altitude_km` (at the steps' ends), the parts' sums,
-    `episodic_return`, `points` (`precision_points`), `crashed`; with dispersion or failures `draw` (N, k) and `dry`,
-    out of fuel; with failures `failure` (N, 3): group of engines, moment (s) and share lost, of a healthy flight
-    -1, 0, 0; with navigation noise `final_y` (N, 7), the exact r, v and m.
+    With a `cutoff` mission (ours; the paper fixes the final time) the engine stops when the energy reaches the target's
+    in the last phase. The moment is found within the step, to 1e-10, and ends the episode.
 
-    Attributes for training alone, to be set before a `reset`: `guidance` (whether R_guidance is charged),
-    `flights_per_start` (`BatchedEnv`; of each draw of a `reset`) and `terminal_scale`, a curriculum: the *reward* pays
-    R_terminal with it, `final_info` reports it with `TERMINAL_SCALE`; and `failure_time`, "ignition" for a while where
-    it was "random". Our training leaves the others as they are: `mass_weight` (a price per `mass_unit`),
-    `trajectory_weight`, `guidance_weight` and `end_time` (s, at most the last phase's end).
+    Every flight also ends below altitude 0, which is a crash, and at `end_time`. With cut-off and draws the burn-out of
+    the flight's own last stage takes the place of `end_time`, so t_norm may end below 0. This holds unless `end_time`
+    was changed or is not the last burn's end.
+
+    Reward: the sum of R_orbital, R_trajectory, R_guidance, R_penalties and R_terminal, which are functions of
+    `rewards.py`. `final_info` has, (N,) each unless a shape is given:
+
+    - `error_norm`, and `error` (N, 6), the terminal error in ECI
+    - `a_km e i_deg raan_deg argp_deg final_mass_kg final_time_s`
+    - `max_altitude_km`, of the steps' ends
+    - the sums of the five parts, `episodic_return`, `points` (`precision_points`) and `crashed`
+    - with dispersion or failures `draw` (N, k), and `dry` for a flight that is out of fuel
+    - with failures `failure` (N, 3): group of engines, moment (s) and share lost; -1, 0, 0 for a healthy flight
+    - with navigation noise `final_y` (N, 7), the exact r, v and m
+
+    A training may set these attributes before a `reset`:
+
+    - `flights_per_start` (`BatchedEnv`): flights of each draw of a `reset`
+    - `guidance`: whether R_guidance is charged
+    - `terminal_scale`: the scale of R_terminal in the reward, a curriculum; `final_info` keeps `TERMINAL_SCALE`
+    - `failure_time`: "ignition" for a while where it was "random"
+    - `mass_weight` (a price per `mass_unit`), `trajectory_weight`, `guidance_weight` and `end_time` (s, at most the
+      last phase's end), which our training leaves as they are
     """
 
     metadata = {**BatchedEnv.metadata, **RENDERED}
@@ -182,13 +198,13 @@ class RocketVectorEnv(BatchedEnv):
         self._everyone = np.arange(num_envs)
 
     def _build(self):
-        """The vehicles: all alike until an episode draws its own."""
+        """Make the vehicles, which are all nominal until an episode draws its own."""
         self._scores_drawn = len(draw_names(self.rocket))
         self.draw = np.zeros((self.num_envs, self._scores_drawn))
         self.vehicles = nominal_vehicles(self.rocket, self.num_envs)
         if not self.has_draws:
             return
-        # of the flight computer: by burn the nominal mass at its beginning and the flow
+        # the flight computer's nominal mass (kg) at each burn's beginning, and each burn's flow (kg/s)
         nominal = draw_vehicles(self.rocket, self.dispersion, self.draw)
         ends, flow, dropped = (getattr(nominal, name)[:-1, 0] for name in ("end", "flow", "dropped"))
         burnt = flow[:-1] * np.diff(ends[:-1], prepend=0.0)
@@ -199,12 +215,13 @@ class RocketVectorEnv(BatchedEnv):
         self.vehicles = self._drawn(self.draw)
 
     def _drawn(self, draw):
-        """The vehicles of draws."""
+        """The vehicles of draws (n, k)."""
         return draw_vehicles(self.rocket, self.dispersion, draw, self.failure, self.failure_time)
 
     def _spaces(self):
-        """The spaces of one environment, which hold all that may be drawn."""
-        self._draw_bounds, self._largest = draw_bounds(self.rocket, self.dispersion), nominal_vehicles(self.rocket, 1)
+        """The spaces of one environment. Their bounds hold every vehicle that may be drawn."""
+        self._draw_bounds = draw_bounds(self.rocket, self.dispersion)
+        self._largest = nominal_vehicles(self.rocket, 1)
         if self.has_draws:
             failure_time = self.failure_time if self.failure else ""
             self._largest = self._drawn(largest_draw(self.rocket, self.dispersion, failure_time))
@@ -221,7 +238,7 @@ class RocketVectorEnv(BatchedEnv):
 
     @property
     def end_time(self) -> float:
-        """Seconds after which an episode ends at the latest; the last step is shorter where 2 s do not divide it."""
+        """Seconds after which an episode ends at the latest. The last step is shorter if 2 s do not divide it."""
         return self._end_time
 
     @end_time.setter
@@ -230,7 +247,7 @@ class RocketVectorEnv(BatchedEnv):
             raise ValueError(f"end_time is {value} s; it must be positive and at most {self.rocket.end_time}")
         self._end_time = float(value)
         self.episode_steps = int(self._set_ends(self._largest).max())
-        # where nothing is drawn all flights share their steps, worked out here for the one vehicle
+        # without draws all flights have the same steps, which are worked out once for the one vehicle
         self._table = None
         if not self.has_draws:
             *clock, arc = self._work_out(np.arange(self.episode_steps + 1), self._largest)
@@ -238,7 +255,7 @@ class RocketVectorEnv(BatchedEnv):
         self._set_ends(self.vehicles)
 
     def _set_ends(self, vehicles):
-        """When the episodes of these vehicles end at the latest: sets and returns the number of their steps."""
+        """Set when the episodes of these vehicles end at the latest. Returns the number of their steps."""
         own = self.has_draws and self.cutoff and self._end_time == self.rocket.end_time == self.rocket.burns[-1].end
         self._latest = vehicles.burn_out if own else np.full(len(vehicles.mass), self._end_time)  # s
         self._steps = np.maximum(np.ceil(self._latest / self.rocket.dt - 1e-9), 1.0).astype(np.int64)
@@ -259,18 +276,24 @@ class RocketVectorEnv(BatchedEnv):
             self._draw_noise(mask, options.get("noise"))
         self.y[:, mask] = self.rocket.x0[:, None]
         self.y[6, mask] = self.vehicles.mass[mask]
-        self._parts[:, mask] = self.u[:, mask] = 0.0
-        self._max_altitude[mask] = self.time[mask] = 0.0
+        self._parts[:, mask] = 0.0
+        self.u[:, mask] = 0.0
+        self._max_altitude[mask] = 0.0
+        self.time[mask] = 0.0
         distance, energy = self._progress()
-        self._distance[mask], self._energy[mask] = distance[mask], energy[mask]
+        self._distance[mask] = distance[mask]
+        self._energy[mask] = energy[mask]
 
     def _launch(self, mask, given):
-        """Vehicles for the environments in `mask`: of the given draws (N, k), else of new ones.
+        """Set the vehicles of the environments in `mask`, by the given draws (N, k) or by new ones.
 
-        New ones are `flights_per_start` environments' each, in the order of those in `mask`.
+        Each new draw is for `flights_per_start` environments, in the order of those in `mask`.
         """
-        draw = self._draw_starts(self._scores, int(mask.sum())) if given is None else self._checked_draw(given)[mask]
-        drawn = self._drawn(draw)  # before anything is changed: it may be refused
+        if given is None:
+            draw = self._draw_starts(self._scores, int(mask.sum()))
+        else:
+            draw = self._checked_draw(given)[mask]
+        drawn = self._drawn(draw)  # before anything is changed, because a draw may be refused
         self.draw[mask] = draw
         for mine, new in zip(self.vehicles, drawn):
             mine[..., mask] = new
@@ -284,7 +307,7 @@ class RocketVectorEnv(BatchedEnv):
         return super().generators | {"navigation": self._noise_generator()}
 
     def _noise_generator(self) -> np.random.Generator:
-        """The noise's own stream, a child of the seeded one, which it leaves as it is."""
+        """The noise's own stream. It is a child of the seeded one, which stays as it is."""
         seeded = self.np_random
         if self._noise_stream is None or self._noise_stream[0] is not seeded:
             (child,) = seeded.spawn(1)
@@ -292,10 +315,10 @@ class RocketVectorEnv(BatchedEnv):
         return self._noise_stream[1]
 
     def _draw_noise(self, mask, given):
-        """The noise of the whole episodes that begin in `mask`: given (N, T, 6), else new."""
+        """Set the noise of the whole episodes that begin in `mask`, by the given scores (N, T, 6) or by new ones."""
         observations = self.episode_steps + 1
         missing = observations - self._noise.shape[1]
-        if missing > 0:  # longer flights than before; those that are running end earlier
+        if missing > 0:  # flights can be longer than before; those that are running end earlier
             self._noise = np.pad(self._noise, ((0, 0), (0, missing), (0, 0)))
         if given is None:
             self._noise[mask] = self._noise_generator().standard_normal((int(mask.sum()), *self._noise.shape[1:]))
@@ -313,7 +336,7 @@ class RocketVectorEnv(BatchedEnv):
         self._noise[mask, :observations] = noise[mask, :observations]
 
     def _scores(self, n):
-        """Draws (n, k). Those of groups come in pairs, z and -z: few draws then have no mean of their own."""
+        """New draws (n, k). Draws of groups come in pairs, z and -z, so that the mean of a few is near zero."""
         in_pairs = self.flights_per_start > 1
         if in_pairs:
             half = self.np_random.standard_normal((-(-n // 2), self._scores_drawn))
@@ -326,9 +349,9 @@ class RocketVectorEnv(BatchedEnv):
         return np.hstack([scores, failure_scores(self.np_random, n, in_pairs)])
 
     def _checked_draw(self, given):
-        """The draws of `reset` (N, k), float64, with a healthy flight's where they hold no failure.
+        """The draws given to `reset` (N, k), in float64. Draws without failures get a healthy flight's numbers.
 
-        BadInput where they are none.
+        Raises BadInput for anything else.
         """
         widths = [self._scores_drawn, self.draw.shape[1]]
         shapes = " or ".join(str((self.num_envs, width)) for width in dict.fromkeys(widths))
@@ -382,7 +405,7 @@ class RocketVectorEnv(BatchedEnv):
         return self.vehicles.burn[self._schedule().arc, self._everyone]
 
     def _schedule(self) -> Schedule:
-        """Of the running steps."""
+        """The schedule of the running steps."""
         if self._table is None:
             return self._work_out(self.t, self.vehicles)
         clock, arc = self._table
@@ -390,7 +413,7 @@ class RocketVectorEnv(BatchedEnv):
         return Schedule(begin, end, phi, arc[self.t])
 
     def _work_out(self, t, vehicles) -> Schedule:
-        """Of the steps t (N,) of these vehicles. After an episode's last step phi is still that one's."""
+        """The schedule of the steps t (N,) of these vehicles. After an episode's last step phi keeps its value."""
         dt, ends = self.rocket.dt, vehicles.end
         begin = np.where(t >= self._steps, self._latest, dt * t)
         end = np.where(t + 1 >= self._steps, self._latest, dt * (t + 1))
@@ -399,19 +422,19 @@ class RocketVectorEnv(BatchedEnv):
         return Schedule(begin, end, phi, arc)
 
     def _computed_mass(self):
-        """The flight computer's mass (N,) in kg: the nominal burn's, counted from the staging that has just been."""
+        """The flight computer's mass (N,) in kg. It follows the nominal burn from the last staging on."""
         ends = self.vehicles.burn_end
         burn = (ends[: self._last_phase] <= self.time).sum(axis=0)
         began = np.where(burn > 0, ends[burn - 1, self._everyone], 0.0)
         return np.maximum(self._seen_mass[burn] - self._seen_flow[burn] * (self.time - began), self.rocket.dry_mass)
 
     def _directions(self, actions):
-        """Unit thrust directions in ECI (3, N) of actions (N, 3); BadInput names the first of length zero."""
+        """Unit thrust directions in ECI (3, N) of actions (N, 3). Raises BadInput for the first of length zero."""
         largest = np.abs(actions).max(axis=1)
         if not largest.all():
             bad = int(np.argmin(largest))
             raise BadInput(f"action of env {bad} at step {self.t[bad]} is [0, 0, 0]; a direction must have a length")
-        u = actions.T / largest  # before squaring: neither overflow nor underflow
+        u = actions.T / largest  # so that squares neither overflow nor underflow
         u /= np.sqrt((u * u).sum(axis=0))
         if self.action_frame == "eci":
             return u
@@ -419,9 +442,13 @@ class RocketVectorEnv(BatchedEnv):
         return up * u[0] + along * u[1] + cross * u[2]
 
     def _advance(self, actions):
-        t, u, before = self.t, self._directions(actions), self.y
+        t = self.t
+        u = self._directions(actions)
+        before = self.y
         begin, end, _, arc = self._schedule()
-        duration, phase, done = end - begin, self.vehicles.burn[arc, self._everyone], t + 1 == self._steps
+        duration = end - begin
+        phase = self.vehicles.burn[arc, self._everyone]
+        done = t + 1 == self._steps
         steps = Steps(u, begin, end, self._everyone, arc)
         self.y = self._fly(before, steps, duration)
         if self.cutoff:
@@ -441,12 +468,12 @@ class RocketVectorEnv(BatchedEnv):
         return rewards, done, self._final_info
 
     def _fly(self, y, steps, duration):
-        """States (7, n) `duration` (n,) s after the begin of these steps. y (7, n): the states at the begin.
+        """The states (7, n) at `duration` (n,) s after the begin of these steps. y (7, n) are the states at the begin.
 
-        Each round flies from one event to the next, or to the end of the duration. Those that met an event then drop
-        what is dropped, and go on in the next arc.
+        Each round flies to the next event or to the end of the duration. Flights that met an event drop their mass and
+        go on in the next arc.
         """
-        flown, flying = None, None  # (7, n), and its columns that are still flying: at first all
+        flown, flying = None, None  # (7, n), and its columns that are still flying; None: all of them
         while True:
             event = self.vehicles.end[steps.arc, steps.who]
             until_event = event - steps.begin
@@ -457,7 +484,7 @@ class RocketVectorEnv(BatchedEnv):
                 flown[:, flying] = y
             met = np.flatnonzero(event <= steps.end)
             if len(met):
-                # a duration is rounded: an event at the step's very end, which the next step takes as past, is met
+                # durations are rounded; an event at the very end of the step counts as met, as in the next step
                 met = met[(duration >= until_event - 1e-9)[met]]
             if not len(met):
                 return flown
@@ -468,15 +495,19 @@ class RocketVectorEnv(BatchedEnv):
             steps = steps.of(met)._replace(begin=event[met], arc=steps.arc[met] + 1)
 
     def _fly_arc(self, y, steps, dt):
-        """States (7, n) after dt (n,) seconds without an event: one RK4 step, several for a plunge into dense air.
+        """The states (7, n) after dt (n,) seconds without an event, by one RK4 step.
 
-        There drag is stiff: its rate times the step, at the lowest altitude that the step can reach, is kept below
-        `STIFF`. No ascent comes near it; without this a crash at orbital speed would end in numbers without meaning.
+        A plunge into dense air takes several RK4 steps, because drag is stiff there. Its rate times the step, at the
+        lowest altitude that the step can reach, is kept below `STIFF`. No ascent comes near this limit. Without it a
+        crash at orbital speed would end in meaningless numbers.
         """
-        rocket, (arc, who) = self.rocket, (steps.arc, steps.who)
+        rocket, arc, who = self.rocket, steps.arc, steps.who
         controls = (*steps.u, self.vehicles.thrust[arc, who], self.vehicles.flow[arc, who])
-        drag, wind = (self.vehicles.drag[who], self.vehicles.wind[:, who]) if self.dispersion else (None, None)
-        # the state as one component (7, n): rk4 then takes a seventh of the array operations
+        drag, wind = None, None
+        if self.dispersion:
+            drag = self.vehicles.drag[who]
+            wind = self.vehicles.wind[:, who]
+        # with the state as one component (7, n), rk4 takes a seventh of the array operations
         f = lambda x, u: (np.array(ascent_dynamics(x[0], u, rocket, wind, drag)),)  # noqa: E731
         speed = np.sqrt((y[3:6] ** 2).sum(axis=0))
         lowest = np.maximum(np.sqrt((y[:3] ** 2).sum(axis=0)) - rocket.Re - speed * dt, 0.0)
@@ -486,32 +517,35 @@ class RocketVectorEnv(BatchedEnv):
         (y_next,) = rk4(f, (y,), controls, dt)
         stiff = np.flatnonzero(rate * dt > STIFF)
         if len(stiff):
-            n = np.ceil((rate * dt)[stiff] / STIFF)  # for each its own: it must not depend on the rest of the batch
-            y_sub, controls, dt = y[:, stiff], tuple(c[stiff] for c in controls), dt[stiff] / n
+            n = np.ceil((rate * dt)[stiff] / STIFF)  # each flight's own number, which no other flight changes
+            y_sub = y[:, stiff]
+            controls = tuple(c[stiff] for c in controls)
+            dt = dt[stiff] / n
             if drag is not None and wind is not None:
-                drag, wind = drag[stiff], wind[:, stiff]
+                drag = drag[stiff]
+                wind = wind[:, stiff]
             for k in range(int(n.max())):
-                aloft = (y_sub[:3] ** 2).sum(axis=0) >= rocket.Re**2  # who is below the ground stays there
+                aloft = (y_sub[:3] ** 2).sum(axis=0) >= rocket.Re**2  # a flight below the ground stays there
                 y_sub = np.where(aloft & (k < n), rk4(f, (y_sub,), controls, dt)[0], y_sub)
             y_next[:, stiff] = y_sub
         return y_next
 
     def _cut_off(self, before, after, steps, duration):
-        """States (7, n) and times (n,), s after the begin of these steps, at which the energy is the target's.
+        """The states (7, n) and times (n,), in s after the begin of the steps, at which the energy is the target's.
 
-        before, after (7, n): the states at the begin and `duration` (n,) s later, when it is passed. Regula falsi with
-        the Illinois change (Dowell and Jarratt, 1971): where the same end of the bracket is replaced twice, the other
-        end's value is halved. The energy grows almost linearly in a step, so that four evaluations reach rounding; six,
-        for all alike, keep a row independent of the rest of the batch.
+        before and after (7, n) are the states at the begin and `duration` (n,) s later, when the energy has been
+        passed. The method is regula falsi with the Illinois change (Dowell and Jarratt, 1971): if the same end of the
+        bracket is replaced twice, the other end's value is halved. The energy grows almost linearly in a step, so four
+        evaluations reach rounding. All rows take six, so that no row depends on the rest of the batch.
         """
 
         def excess(y):
             return specific_energy(y, self.rocket.mu) - self.rocket.target_energy
 
         low, high = np.zeros(len(duration)), duration
-        f_low = np.minimum(excess(before), -1e-300)  # who is beyond it at the begin is cut off there
+        f_low = np.minimum(excess(before), -1e-300)  # a flight that begins beyond the energy is cut off there
         f_high = excess(after)
-        replaced_high = np.full(len(duration), -1)  # whether the last round replaced `high`; -1: there was none
+        replaced_high = np.full(len(duration), -1)  # whether the last round replaced `high`; -1 before the first
         y, time = after, duration
         for _ in range(6):
             time = low - f_low * (high - low) / (f_high - f_low)
@@ -519,18 +553,22 @@ class RocketVectorEnv(BatchedEnv):
             f = excess(y)
             above = f >= 0
             divisor = 1 + (above == replaced_high)
-            f_low, f_high = np.where(above, f_low / divisor, f), np.where(above, f, f_high / divisor)
-            low, high = np.where(above, low, time), np.where(above, time, high)
+            f_low = np.where(above, f_low / divisor, f)
+            f_high = np.where(above, f, f_high / divisor)
+            low = np.where(above, low, time)
+            high = np.where(above, time, high)
             replaced_high = above
         return y, time
 
     def _reward(self, before, u, phase, altitude, done):
-        """The five parts of this step, added to their sums; returns what is paid, (N,): their total, R_terminal with
-        `terminal_scale`."""
+        """Add the five parts of this step to their sums. Returns the reward (N,): their total.
+
+        The reward has R_terminal with `terminal_scale`, the sums have it with `TERMINAL_SCALE`.
+        """
         t = self.t
         distance, energy = self._progress()
         turn = np.sqrt(((u - self.u) ** 2).sum(axis=0)) * (t > 0)
-        if self._has_coasts:  # a direction without thrust counts for nothing, nor does the turn away from it
+        if self._has_coasts:  # without thrust neither a direction nor the turn away from it counts
             coasts = self._coasts[phase]
             turn = turn * ~(coasts | self._coasted)
             self._coasted = coasts
@@ -555,7 +593,8 @@ class RocketVectorEnv(BatchedEnv):
 
     def _final_info(self):
         y = self.y.T
-        error, elements = terminal_error(y, self.rocket), orbital_elements(y, self.rocket.mu)
+        error = terminal_error(y, self.rocket)
+        elements = orbital_elements(y, self.rocket.mu)
         error_norm = np.sqrt((error * error).sum(axis=1))
         info = {"error": error, "error_norm": error_norm, "a_km": elements.a / 1e3, "e": elements.e}
         info |= {f"{name}_deg": np.degrees(getattr(elements, name)) for name in ("i", "raan", "argp")}
@@ -573,7 +612,7 @@ class RocketVectorEnv(BatchedEnv):
         return self.time.copy(), self.u.T.copy(), self.y.T.copy()
 
     def _make_sheet(self):
-        # Matplotlib takes a quarter of a second that only a picture should cost
+        # only a picture should wait the quarter of a second that Matplotlib takes to load
         from rocket.animation import AscentSheet
 
         title = "Rocket ascent, nominal stagings marked" if self.has_draws else "Rocket ascent"
@@ -581,16 +620,17 @@ class RocketVectorEnv(BatchedEnv):
 
 
 def reachable(rocket: Rocket, dispersion: float, end: float) -> tuple[float, float]:
-    """Bounds of |r| (m) and |v| (m/s): the launcher's delta-v and gravity all pointing one way, until the `end` (s).
+    """Bounds of |r| (m) and |v| (m/s), as if delta-v and gravity pointed one way until `end` (s).
 
-    With dispersion the delta-v is bounded by one stage's with the fastest exhaust, the heaviest start and the lightest
-    end.
+    With dispersion the bound of the delta-v is that of one stage with the fastest exhaust, the heaviest start and the
+    lightest end.
     """
     gain = delta_v(rocket)
     if dispersion:
         draw = largest_draw(rocket, dispersion)
         scores = dict(zip(draw_names(rocket), draw_bounds(rocket, dispersion)))
-        heavy, light = draw_vehicles(rocket, dispersion, draw), draw_vehicles(rocket, dispersion, -draw)
+        heavy = draw_vehicles(rocket, dispersion, draw)
+        light = draw_vehicles(rocket, dispersion, -draw)
         engines = [(e.thrust, e.flow(rocket.table_isp)) for burn in rocket.burns for _, e in burn.engines]
         fastest = max((thrust / flow for thrust, flow in engines if flow), default=0.0)
         gain = fastest * (1 + dispersion * DISPERSION.isp * scores["isp_1"])
@@ -600,7 +640,7 @@ def reachable(rocket: Rocket, dispersion: float, end: float) -> tuple[float, flo
 
 
 class RocketEnv(SingleEnv):
-    """One `RocketVectorEnv`; its public attributes are the batch's."""
+    """One flight of `RocketVectorEnv`, with the batch's public attributes."""
 
     mass_weight = of_batch("mass_weight", "Reward lost per `mass_unit` of propellant burnt in the last phase.")
     trajectory_weight = of_batch("trajectory_weight", "Weight of R_trajectory.")
@@ -608,25 +648,23 @@ class RocketEnv(SingleEnv):
     guidance = of_batch("guidance", "Whether R_guidance charges for leaving the reference pitch.")
     end_time = of_batch("end_time", "Seconds after which an episode ends at the latest.")
     terminal_scale = of_batch("terminal_scale", "The scale of R_terminal in the reward; reports keep TERMINAL_SCALE.")
-    draw = property(
-        lambda self: self.batch.draw, doc="The running episode's draw (1, k), zeros where nothing is drawn."
-    )
+    draw = property(lambda self: self.batch.draw, doc="The running episode's draw (1, k); zeros if nothing is drawn.")
 
 
 def flown_mission(mission: Mission, rocket: Rocket | None = None, table_isp: bool = False) -> Mission:
-    """A mission as these options of the environment have it flown: by another rocket, with the table's Isp."""
+    """The mission with these options of the environment: another rocket, or the table's Isp."""
     rocket = rocket or mission.rocket
     return replace(mission, rocket=replace(rocket, table_isp=table_isp or rocket.table_isp))
 
 
 def make_rocket_vector(env_id: str, num_envs: int = 1, rocket: Rocket | None = None, **options) -> RocketVectorEnv:
-    """The batched environment of a mission in `ROCKETS`, or of another rocket on it; `gymnasium.make_vec` calls it."""
+    """The batched environment of a mission in `ROCKETS`, or of another rocket on it. `gymnasium.make_vec` calls it."""
     check_options(RocketVectorEnv, options, "rocket")
     return RocketVectorEnv(num_envs, flown_mission(ROCKETS[env_id], rocket), **options).sealed()
 
 
 def make_rocket(env_id: str, **options) -> RocketEnv:
-    """The single environment of a mission in `ROCKETS`; what `gymnasium.make` calls."""
+    """The single environment of a mission in `ROCKETS`. `gymnasium.make` calls it."""
     refuse_autoreset(options)
     return RocketEnv(make_rocket_vector(env_id, **options)).sealed()
 
@@ -634,13 +672,14 @@ def make_rocket(env_id: str, **options) -> RocketEnv:
 def fly_rocket(
     env_id: str, policy: Callable, end_time: float | None = None, draw=None, noise: Callable | None = None, **options
 ) -> dict:
-    """Fly `policy(obs (1, obs), t) -> action (1, 3)` once, to `end_time` (s) at the latest, and record what happened.
+    """Fly `policy(obs (1, obs), t) -> action (1, 3)` once, to `end_time` (s) at the latest, and record the flight.
 
-    draw (k,): the vehicle's standard scores and its failure, with the options `dispersion` and `failure`. noise(T): the
-    standard scores (1, T, 6) of its observations, with the option `navigation_noise`; else they are random.
+    - draw (k,): the standard scores of the vehicle and its failure, with the options `dispersion` and `failure`
+    - noise(T): gives the standard scores (1, T, 6) of the observations, with the option `navigation_noise`; without it
+      they are random
 
-    Returns t (K+1,) s, u (K, 3) the unit directions in ECI, y (K+1, 7) r, v, m, reward (K,), `parts` (K, 5), the sums
-    so far of the reward's `PARTS`, and the last step's info.
+    Returns t (K+1,) s, u (K, 3) unit directions in ECI, y (K+1, 7) with r, v and m, reward (K,), the sums so far of
+    `PARTS` as `parts` (K, 5), and the entries of the last step's `final_info`.
     """
     env: Any = gym.make_vec(env_id, num_envs=1, **options)  # a RocketVectorEnv
     if end_time is not None:
@@ -649,7 +688,9 @@ def fly_rocket(
     if noise is not None and env.navigation_noise:
         given["noise"] = noise(env.episode_steps + 1)
     obs, _ = env.reset(options=given)
-    t, u, y, rewards, parts, final = [0.0], [], [env.y[:, 0].copy()], [], [], {}
+    t, y = [0.0], [env.y[:, 0].copy()]
+    u, rewards, parts = [], [], []
+    final = {}
     while not final:
         obs, reward, _, final = env.advance(policy(obs, len(u)))
         t.append(env.time[0])
@@ -662,14 +703,15 @@ def fly_rocket(
     return {**flight, "parts": np.array(parts), **final}
 
 
-make_rocket.metadata = RENDERED  # where gym.make looks before there is an environment
+make_rocket.metadata = RENDERED  # gym.make looks here before there is an environment
 
 
 def register_rocket(env_id: str, rocket: Rocket, cutoff: bool = False, ceiling_km: float | None = None, **rules):
-    """Make a rocket an environment id that references, evaluation, figures and `ppo_gtrxl_rocket.py` take, too.
+    """Register a rocket as an environment id, which `ppo_gtrxl_rocket.py`, evaluations and references then take, too.
 
-    `cutoff`, `ceiling_km` and `rules` are the fields of `Mission`. An id that is registered already is replaced, with a
-    warning if it was another rocket's. Raises BadInput where the id is another environment's or not one of Gymnasium's.
+    `cutoff`, `ceiling_km` and `rules` are the fields of `Mission`. An id that is registered already is replaced. A
+    warning says so if it was another rocket's. Raises BadInput if the id is another environment's or not in Gymnasium's
+    form.
     """
     others = gym.registry.keys() - ROCKETS.keys()
     if env_id in others or not ENV_ID_RE.fullmatch(env_id) or "/" in env_id:

@@ -1,4 +1,4 @@
-"""What is taken along of a rocket's flights: names and units of a policy's numbers, columns of a table, the track."""
+"""A rocket's policy and flights for other tools: names and units of a policy's numbers, table columns, the track."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ACTIONS = {"eci": ("x", "y", "z"), "local": ("up", "along_track", "cross_track")
 def interface(
     rocket: Rocket, action_frame: str = "eci", observe_phase: bool = True, observe_draw: bool = False, **options
 ) -> Interface:
-    """What a policy on these options of the environment observes and commands."""
+    """What a policy observes and commands, with these options of the environment."""
     units = [*["m"] * 3, *["m/s"] * 3, "kg", "1", "1"]
     observation = list(zip(("x", "y", "z", "vx", "vy", "vz", "mass", "time_left", "phase"), units))
     if observe_draw:
@@ -39,7 +39,7 @@ def interface(
 
 
 def step_columns(rocket: Rocket, arrays: dict, launch_longitude: float) -> dict[str, np.ndarray]:
-    """The nominal flight, a row each step: the state, the thrust's direction from there on, the burn, from 1."""
+    """The columns of the nominal flight, a row for each step: state, thrust direction from there on, burn from 1."""
     track = track_of("", rocket, arrays)
     ends = [burn.end for burn in rocket.burns[:-1]]
     direction = np.vstack([arrays["u"], np.full((1, 3), np.nan)])
@@ -53,7 +53,7 @@ def step_columns(rocket: Rocket, arrays: dict, launch_longitude: float) -> dict[
 
 
 def flight_columns(rocket: Rocket, arrays: dict, dispersion: float) -> dict[str, np.ndarray]:
-    """The dispersed flights, a row each: standard scores, end, and the orbit."""
+    """The columns of the dispersed flights, a row for each: standard scores, end and orbit."""
     flights = recorded_flights(arrays, rocket, dispersion)
     orbit = {key: flights[key] for key in ("error_norm", "a_km", "e", "i_deg", "raan_deg", "argp_deg")}
     perigee, apogee = (apsides_of(flights, rocket)[key] for key in ("perigee_km", "apogee_km"))
@@ -71,14 +71,14 @@ def flight_columns(rocket: Rocket, arrays: dict, dispersion: float) -> dict[str,
 
 
 def apsides_of(flights: dict, rocket: Rocket) -> dict:
-    """Altitudes of perigee and apogee (n,) in km; no apogee, NaN, on a hyperbola."""
+    """Altitudes of perigee and apogee (n,) in km. The apogee of a hyperbola is NaN."""
     both = [apsides(a, e, rocket) for a, e in zip(flights["a_km"], flights["e"])]
     found = {key: np.array([row[key] for row in both]) for key in ("perigee_km", "apogee_km")}
     return {key: np.where(np.isfinite(values), values, np.nan) for key, values in found.items()}
 
 
 def track_of(name: str, rocket: Rocket, arrays: dict) -> Track:
-    """The nominal flight."""
+    """The track of the nominal flight."""
     begins = [0.0, *(burn.end for burn in rocket.burns[:-1])]
     end = arrays["t"][-1]
     burns = zip(begins, rocket.burns)
@@ -90,6 +90,6 @@ def track_of(name: str, rocket: Rocket, arrays: dict) -> Track:
 
 
 def earth_track(env_id: str, rocket: Rocket, arrays: dict) -> Track:
-    """The track of a rocket that is launched from the Earth; BadInput for another planet's."""
+    """The track of a rocket that is launched from the Earth. Raises BadInput for another planet."""
     refuse_unless(rocket.body == "Earth", f"mu of {env_id}", rocket.mu, "must be the Earth's: OEM and CZML name it")
     return track_of(env_id, rocket, arrays)

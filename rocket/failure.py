@@ -1,9 +1,9 @@
-"""A hidden loss of thrust: in half of the flights one engine type gives less from a moment of its burn on.
+"""A hidden loss of thrust: in half of the flights one group of engines gives less thrust from some moment on.
 
-Thrust and propellant flow fall together, so the engines burn for longer. Nothing announces it but the flight itself.
-The engines that may fail are the groups of `engine_groups`, of one type and dropped together: of the paper's rocket the
-six boosters, the three, stage 1 and stage 2. All are equally likely to fail, each from a moment between its ignition
-and its burn-out.
+Thrust and propellant flow fall together, so the engines burn for longer. Only the flight itself shows the failure. The
+groups that may fail are those of `engine_groups`: engines of one type that are dropped together. The paper's rocket has
+four: six boosters, three boosters, stage 1 and stage 2. All groups are equally likely to fail. A failure strikes at a
+random moment between the group's ignition and its burn-out.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from rocket.vehicle import Rocket, engine_groups
 FAILURE_TIMES = ("random", "ignition")
 LARGEST_FAILURE = 0.3  # share of thrust
 FAILURE_PROBABILITY = 0.5
-# numbers from 0 to 1, all alike likely; a flight fails where the first is below `FAILURE_PROBABILITY`
+# uniform numbers from 0 to 1; a flight fails if the first is below `FAILURE_PROBABILITY`
 FAILURE_DRAW = ("failure", "failed_burn", "moment", "share")
 HEALTHY_DRAW = (1.0, 0.0, 0.0, 0.0)
 NEEDS_CUTOFF = "must be 0 where flights end at a fixed time: engines that burn for longer need an id with cut-off"
 
 
 def check_failure(failure: float, failure_time: str, cutoff: bool):
-    """BadInput for failures that cannot be drawn, or of a mission whose flights all end at one time."""
+    """Raise BadInput for failures that cannot be drawn, or for a mission whose flights all end at one time."""
     possible = is_finite(failure) and 0 <= failure <= LARGEST_FAILURE
     refuse_unless(possible, "failure", repr(failure), f"must be a number from 0 to {LARGEST_FAILURE}")
     allowed = f"must be one of {', '.join(FAILURE_TIMES)}"
@@ -34,26 +34,26 @@ def check_failure(failure: float, failure_time: str, cutoff: bool):
 
 
 class Losses(NamedTuple):
-    """What N flights lose: of each group of engines (G of them) a share of thrust and flow, from a moment on.
+    """The losses of N flights: a share of thrust and flow of each of the G groups of engines, from some moment on.
 
     Seconds are counted while the group burns.
     """
 
-    after: np.ndarray  # (G, N) s that the group has burnt when the failure strikes; infinite where it stays healthy
-    share: np.ndarray  # (G, N) lost from then on
+    after: np.ndarray  # (G, N) s that the group has burnt when the failure strikes; infinite if it stays healthy
+    share: np.ndarray  # (G, N) the share lost from then on
 
     def lasts(self, g: int, seconds):
-        """For how long (N,) s group g burns what it would burn in `seconds` (N,) if it stayed healthy."""
+        """The time (N,) in s for which group g burns what a healthy group would burn in `seconds` (N,)."""
         after = self.after[g]
         return np.minimum(seconds, after) + np.maximum(seconds - after, 0.0) / (1 - self.share[g])
 
     def spent(self, g: int, seconds):
-        """In how long (N,) s group g would burn what it burns in `seconds` (N,) if it stayed healthy."""
+        """The time (N,) in s for which a healthy group g would burn what this one burns in `seconds` (N,)."""
         after = self.after[g]
         return np.minimum(seconds, after) + np.maximum(seconds - after, 0.0) * (1 - self.share[g])
 
     def strike(self, groups, end: np.ndarray) -> np.ndarray:
-        """When the failures strike, (N,) s after lift-off, infinite where none does; end (B, N) s: of the burns."""
+        """The times (N,) in s at which failures strike, infinite without one. end (B, N) in s are the burns' ends."""
         begin = np.vstack([np.zeros_like(end[:1]), end[:-1]])
         strike = np.full(end.shape[1], np.inf)
         for g, group in enumerate(groups):
@@ -67,18 +67,18 @@ class Losses(NamedTuple):
 
 
 def no_losses(groups, n: int) -> Losses:
-    """Those of n healthy flights."""
+    """The losses of n healthy flights: none."""
     return Losses(np.full((len(groups), n), np.inf), np.zeros((len(groups), n)))
 
 
 def failing_groups(rocket: Rocket, failure_time: str = "random") -> list[int]:
-    """The groups of engines that may fail, as indices of `engine_groups`: those with thrust; "ignition": the last."""
+    """The groups that may fail, as indices of `engine_groups`: all with thrust, or only the last with "ignition"."""
     with_thrust = [g for g, group in enumerate(engine_groups(rocket)) if group.burns and group.engine.thrust]
     return with_thrust if failure_time == "random" else with_thrust[-1:]
 
 
 def group_names(rocket: Rocket) -> list[str]:
-    """The groups of engines in words: how many leave and when, "6 until 75.2 s"."""
+    """The groups of engines in words, by their number and when they leave: "6 until 75.2 s"."""
     groups = engine_groups(rocket)
     return [f"{group.number} until {rocket.burns[group.dropped_after].end:g} s" for group in groups]
 
@@ -86,9 +86,9 @@ def group_names(rocket: Rocket) -> list[str]:
 def drawn_losses(
     rocket: Rocket, draw: np.ndarray, failure: float, failure_time: str, seconds_lit: np.ndarray
 ) -> Losses:
-    """The losses of draws (N, 4), numbers as in `FAILURE_DRAW`, at most the share `failure`.
+    """The losses of draws (N, 4), which have the numbers of `FAILURE_DRAW`. The largest share is `failure`.
 
-    seconds_lit (G, N): how long the groups burn in these flights if they stay healthy.
+    seconds_lit (G, N) is how long the groups burn in these flights if they stay healthy.
     """
     has_failed, which, moment, share = draw.T
     groups = failing_groups(rocket, failure_time)
@@ -102,7 +102,7 @@ def drawn_losses(
 
 
 def failure_scores(rng: np.random.Generator, n: int, in_pairs: bool = False) -> np.ndarray:
-    """The failures of n draws (n, 4). In pairs, x and 1 - x: then one flight of each pair fails."""
+    """The failures of n draws (n, 4). With `in_pairs` they are x and 1 - x, so one flight of each pair fails."""
     if not in_pairs:
         return rng.random((n, len(FAILURE_DRAW)))
     half = rng.random((-(-n // 2), len(FAILURE_DRAW)))
@@ -110,7 +110,7 @@ def failure_scores(rng: np.random.Generator, n: int, in_pairs: bool = False) -> 
 
 
 def largest_failures(rocket: Rocket, failure_time: str) -> np.ndarray:
-    """(F, 4): draws of the longest burns: each group that may fail loses all that it may, from its ignition on."""
+    """The failures (F, 4) with the longest burns: each group that may fail loses the most, from its ignition on."""
     count = len(failing_groups(rocket, failure_time))
     which = (np.arange(count) + 0.5) / count
     zeros = np.zeros(count)

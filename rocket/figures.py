@@ -17,15 +17,15 @@ from rocket.missions import Mission
 from rocket.orbits import local_frame, orbit_vectors, target_axes, target_orbit
 from rocket.vehicle import Rocket
 
-DASHED = {"linewidth": 1.4, "linestyle": (0, (6, 5))}  # one line a panel: gaps that show the other line beneath
+DASHED = {"linewidth": 1.4, "linestyle": (0, (6, 5))}  # the gaps show the other line beneath
 OURS, BEST = {**POLICY, "linewidth": 2.2}, {**OPTIMUM, **DASHED}
-# velocities share a panel with positions: the same widths and dashes, paler
+# velocities share a panel with positions, so they have the same widths and dashes, but paler colours
 VELOCITY = {**OURS, "color": "lightcoral"}, {**BEST, "color": "deepskyblue", "alpha": 0.6}
 FLIGHTS = {"": OURS, "_reference": BEST}  # by the suffix of their arrays
 
 
 def ascent_figure(mission: Mission, arrays: dict, title: str) -> Figure:
-    """The paper's six panels (mass, altitude, speed, components), the thrust direction below them, pitch and yaw."""
+    """The paper's six panels (mass, altitude, speed, components), and below them thrust direction, pitch and yaw."""
     figure = Figure(figsize=(15, 13), layout="constrained")
     rows = [["mass", "altitude", "speed"], ["x", "y", "z"], ["ux", "uy", "uz"]]
     mosaic = [[name for name in row for _ in range(2)] for row in rows] + [["pitch"] * 3 + ["yaw"] * 3]
@@ -55,7 +55,7 @@ def ascent_figure(mission: Mission, arrays: dict, title: str) -> Figure:
 
 
 def label_ascent(panels: dict, velocity: list, rocket: Rocket):
-    """Axes' labels, the phases' ends, and what is dropped at each of them."""
+    """Label the axes, and mark the phases' ends with what is dropped there."""
     labels = {"mass": "(a) mass (t)", "altitude": "(b) altitude (km)", "speed": "(c) inertial speed (km/s)"}
     labels |= {axis: f"({letter}) position ${axis}$ (km)" for letter, axis in zip("def", "xyz")}
     labels |= {f"u{axis}": f"thrust $u_{axis}$" for axis in "xyz"}
@@ -66,13 +66,13 @@ def label_ascent(panels: dict, velocity: list, rocket: Rocket):
         for burn in rocket.burns[:-1]:
             ax.axvline(burn.end, **BOUNDARY)
     low, high = panels["yaw"].get_ylim()
-    panels["yaw"].set_ylim(min(low, -5), max(high, 5))  # a flight in the plane would show rounding errors only
+    panels["yaw"].set_ylim(min(low, -5), max(high, 5))  # else a flight in the plane would only show rounding errors
     for axis, ax in zip("xyz", velocity):
         ax.set_ylabel(f"velocity $v_{axis}$ (km/s), pale", color="0.4")
         ax.tick_params(axis="y", colors="0.4")
     for k, (burn, dropped) in enumerate(zip(rocket.burns[:-1], rocket.jettison)):  # the last burn drops nothing
         text, height = f" {burn.end:g} s: {dropped / 1e3:.2f} t dropped", 0.9 - 0.15 * (k % 5)  # of the axes
-        side = "left" if burn.end <= rocket.end_time / 2 else "right"  # towards the middle: inside the panel
+        side = "left" if burn.end <= rocket.end_time / 2 else "right"  # text towards the middle stays in the panel
         where = {"transform": panels["mass"].get_xaxis_transform(), "horizontalalignment": side}
         panels["mass"].text(burn.end, height, text if side == "left" else f"{text.strip()} ", fontsize=9, **where)
 
@@ -80,7 +80,7 @@ def label_ascent(panels: dict, velocity: list, rocket: Rocket):
 def pitch_and_yaw(u: np.ndarray, y: np.ndarray, rocket: Rocket) -> tuple[np.ndarray, np.ndarray]:
     """Pitch above the local horizon and yaw from the target plane, (K,) each in degrees, of u (K, 3) at y (K+1, 7).
 
-    Yaw is NaN within six degrees of the vertical: its direction there is noise.
+    Yaw is NaN within six degrees of the vertical, where it is noise.
     """
     up, along, cross = np.einsum("cdk,kd->ck", local_frame(y[: len(u)].T, target_axes(rocket)[2]), u)
     yaw = np.where(np.hypot(along, cross) > 0.1, np.degrees(np.arctan2(cross, along)), np.nan)
@@ -100,10 +100,10 @@ def reached_points(y: np.ndarray, rocket: Rocket) -> np.ndarray:
 def orbit_points(h: np.ndarray, e: np.ndarray, rocket: Rocket) -> np.ndarray:
     """Points (n, 3) in km, ECI, of the orbit with this angular momentum and eccentricity vector, (3,) each.
 
-    r = p / (1 + e . d) in every direction d of its plane, p = |h|^2 / mu; NaN where a hyperbola has none.
+    r = p / (1 + e . d) in every direction d of the plane, with p = |h|^2 / mu. It is NaN where a hyperbola has none.
     """
     normal = h / np.linalg.norm(h)
-    along = np.cross(normal, target_axes(rocket)[0])  # any direction of the plane will do to count from
+    along = np.cross(normal, target_axes(rocket)[0])  # any direction of the plane can be the first
     ahead = along / np.linalg.norm(along)
     angle = np.radians(np.linspace(-180, 180, 3601))[:, None]
     directions = np.cos(angle) * np.cross(ahead, normal) + np.sin(angle) * ahead
@@ -113,9 +113,9 @@ def orbit_points(h: np.ndarray, e: np.ndarray, rocket: Rocket) -> np.ndarray:
 
 
 def orbit_figure(mission: Mission, arrays: dict, title: str, highest_km: float) -> Figure:
-    """Ascent, target orbit and the orbit reached in the target's plane; the insertion enlarged; the ground track.
+    """Ascent, target orbit and orbit reached in the target's plane, the enlarged insertion, and the ground track.
 
-    highest_km: the greatest altitude of both flights.
+    highest_km is the greatest altitude of both flights.
     """
     figure = Figure(figsize=(13, 11), layout="constrained")
     panels = figure.subplot_mosaic([["plane", "insertion"], ["ground", "ground"]], height_ratios=[3, 2])
@@ -138,13 +138,13 @@ def orbit_figure(mission: Mission, arrays: dict, title: str, highest_km: float) 
 
 
 def plot_target_plane(plane, insertion, lines: dict, rocket: Rocket):
-    """The target's plane, perigee to the right, to scale; and in it altitude over angle, from launch to insertion.
+    """Plot the target's plane to scale, with the perigee to the right, and altitude over angle up to the insertion.
 
-    `lines`: label -> (points (n, 3) in km, ECI; style). The second panel cuts the first along the horizon.
+    `lines` are {label: (points (n, 3) in km, ECI, style)}. The second panel unrolls the first along the horizon.
     """
     axes, Re, ends = target_axes(rocket), rocket.Re / 1e3, []
     launch = axes @ lines["policy"][0][0]
-    middle = np.degrees(np.arctan2(launch[1], launch[0])) + 90  # no ascent goes further round the Earth than half
+    middle = np.degrees(np.arctan2(launch[1], launch[0])) + 90  # no ascent goes further than half round the Earth
     for label, (r, style) in lines.items():
         x, y, _ = axes @ r.T
         angle, altitude = (np.degrees(np.arctan2(y, x)) - middle + 180) % 360 - 180, np.linalg.norm(r, axis=1) - Re
@@ -169,7 +169,7 @@ def plot_target_plane(plane, insertion, lines: dict, rocket: Rocket):
 
 
 def plot_ground_track(ax, arrays: dict, rocket: Rocket):
-    """Longitude (the launch site's is 0) and geocentric latitude of both flights, over the turning Earth."""
+    """Plot longitude (0 at the launch site) and geocentric latitude of both flights, over the turning Earth."""
     along = np.radians(np.linspace(-90, 90, 361))[:, None]  # either side of the perigee
     perigee, semi_latus, _ = target_axes(rocket)
     circle = np.cos(along) * perigee + np.sin(along) * semi_latus
@@ -186,7 +186,7 @@ def plot_ground_track(ax, arrays: dict, rocket: Rocket):
     ax.legend(loc="lower left")
 
 
-# policies first; not green, which is the target's
+# policies come first; green is the target's colour
 COLOURS = ("tab:red", "tab:orange", "tab:purple", "tab:cyan", "tab:brown", "tab:blue", "tab:pink", "tab:olive")
 COLOURS += ("tab:gray", "black", "gold", "navy")
 
@@ -194,8 +194,8 @@ COLOURS += ("tab:gray", "black", "gold", "navy")
 def dispersed_figure(rocket: Rocket, flights: dict[str, dict], title: str) -> Figure:
     """Where dispersed flights end: perigee over its argument, inclination over the node, distribution of ||error||.
 
-    `flights`: label -> the `draw`, `final_y`, ... arrays of `evaluate_dispersed`, one colour each. Flights beyond
-    the axes, four boxes wide, are counted in the third panel alone. An angle that the target does not have is left out.
+    `flights` are {label: arrays of `evaluate_dispersed`}, with one colour each. The axes are four boxes wide. Flights
+    beyond them are only in the third panel. An angle that the target does not have is left out.
     """
     figure = Figure(figsize=(15, 5), layout="constrained")
     *scatters, distribution = figure.subplots(1, 3)
@@ -227,8 +227,9 @@ def dispersed_figure(rocket: Rocket, flights: dict[str, dict], title: str) -> Fi
 def losses_figure(report: dict, title: str) -> Figure:
     """The share saved of the savable flights over the share of thrust lost, and kilograms beside the standard law.
 
-    report: `losses.loss_report`. A group of flights stands at the middle of its losses, its bars are 95 % intervals: of
-    a share by Wilson, of a difference the paired one. The group above `LARGE` is left out: others hold its flights.
+    report is that of `losses.loss_report`. A group of flights is at the middle of its losses. Bars are 95 % intervals,
+    by Wilson for a share, and paired for a difference. The group above `LARGE` is left out, because its flights are
+    also in other groups.
     """
     figure = Figure(figsize=(12, 5), layout="constrained")
     share, kilograms = figure.subplots(1, 2)
@@ -239,7 +240,7 @@ def losses_figure(report: dict, title: str) -> Figure:
             places[label] = (float(low.rstrip("%")) + float(high.rstrip("%"))) / 2
     names = list(report["0"])
     for k, (name, colour) in enumerate(zip(names, itertools.cycle(COLOURS))):
-        aside = 0.12 * (k - (len(names) - 1) / 2)  # points that coincide would hide one another
+        aside = 0.12 * (k - (len(names) - 1) / 2)  # so that equal points do not hide one another
         style = {"color": colour, "marker": "o", "markersize": 4, "linewidth": 1.0, "capsize": 2, "label": name}
         rows = [(place + aside, report[label][name]) for label, place in places.items()]
         saved = [(x, row["saved"], row["savable"]) for x, row in rows if row["savable"]]

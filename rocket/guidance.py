@@ -6,12 +6,13 @@
                      or with the thrust and flow that the last step's change of velocity shows
     drawn_optima     the optimum of each flight's own vehicle and air: an upper bound on the mass, not a guidance law
 
-A guidance law is `policy(obs (m, obs), t) -> action (m, 3)`, directions in ECI, as `evaluate_dispersed` flies it with
-the environment's own `action_frame="eci"`; it sees r and v, as a policy does, the flight computer's mass, time and
-phase, never the draw. With navigation noise it sees what a policy sees, or estimates (`kalman.py`).
+A guidance law is a function policy(obs (m, obs), t) -> actions (m, 3), directions in ECI. `evaluate_dispersed` flies it
+with `action_frame="eci"`. A law sees what a policy sees: r and v, the flight computer's mass, time and phase, but never
+the draw. With navigation noise it sees the same noise as a policy, or estimates (`kalman.py`). `comparison.py` flies,
+compares and prints the laws.
+
 Reading order: open loop, LQR, the program of the remaining ascent, the measured engine, replanning, the optimum that
-knows the draw.
-`comparison.py` flies, compares and prints them. CasADi is imported only where it solves.
+knows the draw. CasADi is imported only where it solves.
 """
 
 from __future__ import annotations
@@ -53,21 +54,25 @@ def nominal_optimum(env_id: str) -> dict:
 
 
 def open_loop(env_id: str):
-    """The optimum's directions in ECI by time, the last one held where a flight lasts longer."""
+    """The law that flies the optimum's directions in ECI by time, and holds the last one in a longer flight."""
     u = nominal_optimum(env_id)["u"]
-    return lambda obs, t: np.repeat(u[None, min(t, len(u) - 1)], len(obs), axis=0)
+
+    def policy(obs, t):
+        return np.repeat(u[None, min(t, len(u) - 1)], len(obs), axis=0)
+
+    return policy
 
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Time-varying LQR about the optimum
 # ---------------------------------------------------------------------------------------------------------------------
 
-STEERING_WEIGHT = 1e-8  # R: what a radian of steering for a second costs, in squares of the terminal error
-LARGEST_TILT = 0.1  # rad that each of the two angles may turn a direction from the optimum's
+STEERING_WEIGHT = 1e-8  # R, the cost of a radian of steering for a second, in squares of the terminal error
+LARGEST_TILT = 0.1  # rad, the most that each of the two angles may turn a direction from the optimum's
 
 
 def turned(u, axes, angles):
-    """Directions (m, 3) turned from u (m, 3) towards axes (m, 2, 3), at right angles to it, by angles (m, 2) rad."""
+    """The directions u (m, 3) turned by angles (m, 2) rad towards axes (m, 2, 3), which are at right angles to u."""
     w = u + (np.tan(angles)[..., None] * axes).sum(axis=-2)
     return w / np.linalg.norm(w, axis=1, keepdims=True)
 
@@ -83,8 +88,8 @@ def normal_axes(u):
 def linearise_flight(mission: Mission, flight: dict, axes):
     """A (K, 6, 6) and B (K, 6, 2) of dx_{k+1} = A_k dx_k + B_k da_k along a flight, for the environment's own steps.
 
-    x: r (m) and v (m/s); a: the two angles (rad) towards axes (K, 2, 3). Central differences of the nominal
-    environment, events included: the 16 neighbours of a state are one batch.
+    x is r (m) and v (m/s). a are the two angles (rad) towards axes (K, 2, 3). The derivatives are central differences
+    of the nominal environment with its events. The 16 neighbours of a state are one batch.
     """
     h = np.repeat([10.0, 0.01, 1e-4], [3, 3, 2])
     shifts = np.concatenate([np.diag(h), -np.diag(h)])  # (16, 8)
@@ -93,7 +98,8 @@ def linearise_flight(mission: Mission, flight: dict, axes):
     env.reset()
     jacobians = []
     for k, (y, u) in enumerate(zip(flight["y"], flight["u"])):
-        env.t[:], env.y = k, y[:, None] + np.pad(shifts[:, :6], ((0, 0), (0, 1))).T
+        env.t[:] = k
+        env.y = y[:, None] + np.pad(shifts[:, :6], ((0, 0), (0, 1))).T
         env.advance(turned(u, axes[k], shifts[:, 6:]))
         ahead, behind = env.y[:6, :8], env.y[:6, 8:]
         jacobians.append((ahead - behind) / (2 * h))
@@ -113,28 +119,31 @@ def error_jacobian(rocket: Rocket, y):
 def cutoff_jacobian(rocket: Rocket, y, rate):
     """Derivative (6, 6) of the terminal error at the cut-off by r, v of a state y (7,) that moves at `rate` (6,).
 
-    The engine stops at the target's energy, whenever that is: dt = -E_x dx / (E_x rate) later than planned. What a
-    state is ahead or behind along the trajectory costs nothing, only what it is beside it.
+    The engine stops at the target's energy, which is dt = -E_x dx / (E_x rate) later than planned. So a state that is
+    ahead or behind on the trajectory costs nothing. Only a state beside the trajectory does.
     """
     error, energy = error_jacobian(rocket, y)
     return error @ (np.eye(6) - np.outer(rate, energy) / (energy @ rate))
 
 
 def lqr_gains(mission: Mission, flight: dict, steering_weight: float = STEERING_WEIGHT):
-    """Gains (K, 2, 6) of da_k = -G_k dx_k and the axes (K, 2, 3) of the angles, by the backward Riccati recursion.
+    """Gains G_k (K, 2, 6) of da_k = -G_k dx_k and the axes (K, 2, 3) of the angles, by the backward Riccati recursion.
 
-    Minimises |terminal error at the cut-off, or at the fixed time|^2 + sum of R dt |da|^2 along the linearised flight
-    (e.g. Anderson and Moore, Optimal Control, 1990). States on the way have no weight: only the end counts. Nor has the
-    mass, which near the heaviest flight depends on the steering in second order alone; R keeps that small.
+    They minimise |terminal error|^2 + sum of R dt |da|^2 along the linearised flight (e.g. Anderson and Moore, Optimal
+    Control, 1990). The terminal error is that at the cut-off, or at the fixed time. States on the way have no weight,
+    because only the end counts. The mass has none either. Near the heaviest flight it depends on the steering only in
+    second order, which R keeps small.
     """
     axes = normal_axes(flight["u"])
     A, B = linearise_flight(mission, flight, axes)
-    last, dt = flight["y"][-2:], np.diff(flight["t"])
+    last = flight["y"][-2:]
+    dt = np.diff(flight["t"])
     if mission.cutoff:
         C = cutoff_jacobian(mission.rocket, last[1], (last[1] - last[0])[:6] / dt[-1])
     else:
         C, _ = error_jacobian(mission.rocket, last[1])
-    P, gains = C.T @ C, np.empty((len(B), 2, 6))
+    P = C.T @ C
+    gains = np.empty((len(B), 2, 6))
     for k in reversed(range(len(B))):
         gains[k] = np.linalg.solve(steering_weight * dt[k] * np.eye(2) + B[k].T @ P @ B[k], B[k].T @ P @ A[k])
         P = A[k].T @ P @ (A[k] - B[k] @ gains[k])
@@ -143,33 +152,42 @@ def lqr_gains(mission: Mission, flight: dict, steering_weight: float = STEERING_
 
 
 class Tracked(NamedTuple):
-    """A flight of K steps and what LQR needs to fly beside it."""
+    """A flight of K steps, and what LQR needs to track it."""
 
     y: np.ndarray  # (K+1, 7)
     u: np.ndarray  # (K, 3)
     gains: np.ndarray  # (K, 2, 6)
     axes: np.ndarray  # (K, 2, 3)
     ignition: int  # the step in which the last burn begins
-    energy: np.ndarray  # (K+1 - ignition,) J/kg from there on, as it never falls
+    energy: np.ndarray  # (K+1 - ignition,) J/kg from the ignition on, without the falls that rounding makes
 
 
 def tracked(mission: Mission, flight: dict, steering_weight: float = STEERING_WEIGHT) -> Tracked:
     """A flight (t, u, y) of a mission with its gains."""
-    (gains, axes), y, u = lqr_gains(mission, flight, steering_weight), flight["y"], flight["u"]
-    gains[-1], axes[-1] = gains[-2], axes[-2]  # the last step is cut short: its gain would be far too large for a whole
+    gains, axes = lqr_gains(mission, flight, steering_weight)
+    y, u = flight["y"], flight["u"]
+    # the last step is cut short, so its own gain is far too large for a whole step
+    gains[-1] = gains[-2]
+    axes[-1] = axes[-2]
     ignition = int(np.searchsorted(flight["t"], mission.rocket.last_ignition))
     energy = np.maximum.accumulate(specific_energy(y[ignition:].T, mission.rocket.mu))
     return Tracked(y, u, gains, axes, ignition, energy)
 
 
 def tvlqr(env_id: str, by_energy: bool = False, steering_weight: float = STEERING_WEIGHT):
-    """LQR about the optimum, by time; `by_energy` from the last ignition on by the specific energy instead.
+    """The law of an LQR about the optimum, by time, or from the last ignition on by the specific energy (`by_energy`).
 
-    By time the cut-off is met by holding the last direction, and the last whole step's gain, from the optimum's end on.
-    By energy, which grows all through the last burn, a flight is compared with the optimum's state of its own energy:
-    the last gain then comes with the cut-off, whenever that is. R and tilt were chosen on 341 draws of eval seed 1,
-    others than the reported: median ||error|| by time and by energy 2.5e-5 and 1.8e-5 with R = 1e-7, 1.7e-5 and 1.4e-5
-    with 1e-8, 1.9e-5 and 1.3e-5, at a greater p95, with 1e-9; with a tilt of 0.3 rad the same.
+    By time, the last direction and the last whole step's gain are held from the optimum's end until the cut-off. By
+    energy, a flight is compared with the optimum's state of the same energy. The energy grows all through the last
+    burn, so the last gain comes with the cut-off, whenever that is.
+
+    We chose R and the tilt on 341 draws of eval seed 1, which are not the reported ones. A tilt of 0.3 rad gave the
+    same errors. Median ||error|| by R:
+
+        R       by time   by energy
+        1e-7    2.5e-5    1.8e-5
+        1e-8    1.7e-5    1.4e-5
+        1e-9    1.9e-5    1.3e-5 (a greater p95)
     """
     mission = ROCKETS[env_id]
     y, u, gains, axes, ignition, energy = tracked(mission, nominal_optimum(env_id), steering_weight)
@@ -181,7 +199,8 @@ def tvlqr(env_id: str, by_energy: bool = False, steering_weight: float = STEERIN
             now = np.interp(specific_energy(obs.T, mission.rocket.mu), energy, np.arange(ignition, len(y)))
             place = np.where(obs[:, 8] >= phi_last, now, place)
         step = np.minimum(place.astype(int), len(u) - 1)
-        part, nearest = (place - step)[:, None], np.minimum(np.rint(place).astype(int), len(u) - 1)
+        part = (place - step)[:, None]
+        nearest = np.minimum(np.rint(place).astype(int), len(u) - 1)
         dx = obs[:, :6] - (1 - part) * y[step, :6] - part * y[step + 1, :6]
         angles = -np.einsum("mai,mi->ma", gains[nearest], dx).clip(-LARGEST_TILT, LARGEST_TILT)
         return turned(u[nearest], axes[nearest], angles)
@@ -193,29 +212,29 @@ def tvlqr(env_id: str, by_energy: bool = False, steering_weight: float = STEERIN
 # The remaining ascent, from any state in any vehicle and air: one nonlinear program, built once
 # ---------------------------------------------------------------------------------------------------------------------
 
-CALM = (1.0, 0.0, 0.0)  # nominal air: the factor on the drag, the wind towards east and north in m/s
+CALM = (1.0, 0.0, 0.0)  # nominal air: factor on the drag, wind towards east and north in m/s
 
 
 class RemainingAscent(NamedTuple):
-    """What is left of an ascent. The arcs' columns are as `Rocket.arcs` has them, the mass that at their begin."""
+    """What is left of an ascent, in A arcs as in `Rocket.arcs`."""
 
     begin: float  # s
-    state: np.ndarray  # (6,) r (m) and v (m/s) then
-    end: np.ndarray  # (A,) s, of the last arc the latest
+    state: np.ndarray  # (6,) r (m) and v (m/s) at the begin
+    end: np.ndarray  # (A,) s; the last arc may end earlier
     thrust: np.ndarray  # (A,) N
     flow: np.ndarray  # (A,) kg/s
-    mass: np.ndarray  # (A,) kg
+    mass: np.ndarray  # (A,) kg at each arc's begin
     h: np.ndarray  # (3,) m^2/s, angular momentum of the orbit to be reached
-    e: np.ndarray  # (3,) its eccentricity vector
+    e: np.ndarray  # (3,) eccentricity vector of this orbit
     air: tuple[float, float, float] = CALM
 
 
 @cache
 def remaining_solver(rocket: Rocket, fixed: int, last: int):
-    """IPOPT for `fixed` intervals of known ends and `last` ones that share the last arc, of unknown duration.
+    """IPOPT for `fixed` intervals with known ends and `last` intervals of the last arc, whose duration is unknown.
 
-    The program is that of `optimum.ascent_program` with free final time, its numbers being parameters. The
-    rocket gives the Earth and the drag's area alone.
+    The program is that of `optimum.ascent_program` with free final time, but its numbers are parameters. The rocket
+    only gives the Earth and the drag's area.
     """
     import casadi as ca
 
@@ -239,7 +258,7 @@ def remaining_solver(rocket: Rocket, fixed: int, last: int):
 
 
 def remaining_grid(remaining: RemainingAscent, intervals, end: float):
-    """Ends of the intervals (n+1,) and times of the directions (n * points,), s, of one that lasts until `end`."""
+    """Ends of the intervals (n+1,) and times of the directions (n * points,), in s, of an ascent that ends at `end`."""
     edges = [remaining.begin, *remaining.end[:-1], end]
     pieces = (np.linspace(a, b, k + 1)[1:] for a, b, k in zip(edges, edges[1:], intervals))
     t = np.concatenate([[remaining.begin], *pieces])
@@ -247,9 +266,10 @@ def remaining_grid(remaining: RemainingAscent, intervals, end: float):
 
 
 def remaining_parameters(rocket: Rocket, remaining: RemainingAscent, intervals) -> np.ndarray:
-    """The parameters of `remaining_solver` in its order."""
+    """The parameters of `remaining_solver`, in its order."""
     fixed = sum(intervals[:-1])
-    t, arc = remaining_grid(remaining, intervals, remaining.end[-1])[0], np.repeat(np.arange(len(intervals)), intervals)
+    t, _ = remaining_grid(remaining, intervals, remaining.end[-1])
+    arc = np.repeat(np.arange(len(intervals)), intervals)
     mass = remaining.mass[arc] - remaining.flow[arc] * (t[:-1] - np.append(remaining.begin, remaining.end)[arc])
     engine = np.array([mass, remaining.thrust[arc], remaining.flow[arc], np.diff(t)])[:, :fixed]
     start = remaining.state / state_scale(rocket)
@@ -260,16 +280,16 @@ def remaining_parameters(rocket: Rocket, remaining: RemainingAscent, intervals) 
 
 @interruptible()
 def optimise_remaining(rocket: Rocket, remaining: RemainingAscent, guess: dict, intervals: tuple[int, ...]) -> dict:
-    """The heaviest end of a remaining ascent, `intervals` of collocation in each of its arcs.
+    """The optimum of a remaining ascent, which ends with the most mass.
 
-    The guess has t (s), y (r, v), t_u (s), u, as has what is returned, with `final_time` (s), `final_mass` (kg) and
-    `orbit_price` (5,), the kg that a unit of each of the numbers of `orbit_defect` saves. Raises NoOptimum where IPOPT
-    finds none.
+    `intervals` are the numbers of collocation intervals in the arcs. The guess has t (s), y (r, v), t_u (s) and u. The
+    optimum has the same, and `final_time` (s), `final_mass` (kg) and `orbit_price` (5,): the kg that a unit of each
+    number of `orbit_defect` saves. Raises NoOptimum if IPOPT finds none.
     """
     n, points, scale = sum(intervals), len(GAUSS_POINTS), state_scale(rocket)
     solve = remaining_solver(rocket, sum(intervals[:-1]), intervals[-1])
-    ignition = np.append(remaining.begin, remaining.end)[-2]  # of the last arc
-    if not remaining.end[-1] > ignition:  # in dense air a measured flow can even be negative
+    ignition = np.append(remaining.begin, remaining.end)[-2]  # s, when the last arc begins
+    if not remaining.end[-1] > ignition:  # a flow that is measured in dense air can even be negative
         raise NoOptimum(f"the remaining ascent from {remaining.begin} s: nothing is left to burn")
     t, t_u = remaining_grid(remaining, intervals, guess["t"][-1])
     states = interpolate(np.append(t[1:], t_u), guess["t"], guess["y"]) / scale
@@ -286,7 +306,8 @@ def optimise_remaining(rocket: Rocket, remaining: RemainingAscent, guess: dict, 
     w = solution["x"].full()[:, 0]
     end = ignition + w[-1]
     t, t_u = remaining_grid(remaining, intervals, end)
-    times, states = np.append(t[1:], t_u), w[: 6 * n * (1 + points)].reshape(-1, 6) * scale
+    times = np.append(t[1:], t_u)
+    states = w[: 6 * n * (1 + points)].reshape(-1, 6) * scale
     order = np.argsort(times)
     found = {"t": np.append(remaining.begin, times[order]), "y": np.vstack([remaining.state, states[order]])}
     found |= {"t_u": t_u, "u": w[6 * n * (1 + points) : -1].reshape(-1, 3), "status": status}
@@ -297,19 +318,20 @@ def optimise_remaining(rocket: Rocket, remaining: RemainingAscent, guess: dict, 
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The engine that plans are made with: the nominal one, or what the last step's change of velocity shows of it
+# The engine that plans are made with: the nominal one, or the one that the last step's change of velocity shows
 # ---------------------------------------------------------------------------------------------------------------------
 
 
 def nominal_exhaust(rocket: Rocket) -> float:
-    """m/s: the exhaust velocity of the last burn, thrust over flow."""
+    """The exhaust velocity of the last burn in m/s, thrust over flow."""
     burn = rocket.burns[-1]
     return burn.thrust / burn.flow(rocket.table_isp)
 
 
 def drawn_exhaust(rocket: Rocket, dispersion: float, z) -> np.ndarray:
-    """m/s: the last burn's exhaust velocity of each of the draws z (n, k), which no flight could know."""
-    vehicles, last = draw_vehicles(rocket, dispersion, z), len(rocket.burns) - 1
+    """The last burn's exhaust velocities (n,) in m/s for the draws z (n, k). No flight could know them."""
+    vehicles = draw_vehicles(rocket, dispersion, z)
+    last = len(rocket.burns) - 1
     return vehicles.thrust[last] / vehicles.flow[last]
 
 
@@ -319,7 +341,10 @@ def engine_off(rocket: Rocket, y) -> np.ndarray:
 
 
 class NominalEngine:
-    """Mass (kg), thrust (N) and flow (kg/s) of n last stages, (n,) each: the table's and the flight computer's."""
+    """Mass (kg), thrust (N) and flow (kg/s) of n last stages, (n,) each.
+
+    Thrust and flow are the table's, the mass is the flight computer's.
+    """
 
     def __init__(self, rocket: Rocket, n: int):
         burn = rocket.burns[-1]
@@ -329,24 +354,26 @@ class NominalEngine:
         self.flow = np.full(n, burn.flow(rocket.table_isp))
 
     def update(self, obs, u, is_lit):
-        """A step later: obs (n, 9), the directions u (n, 3) flown since, whether the last burn is on (n,)."""
+        """Go a step on: to obs (n, 9), after the directions u (n, 3). is_lit (n,) says whether the last burn is on."""
         self.mass = obs[:, 6]
 
 
 class MeasuredEngine(NominalEngine):
-    """The same by measurement: what a last stage has gained in velocity shows what it has burnt.
+    """Mass, thrust and flow of n last stages by measurement: the velocity that a stage gained shows what it burnt.
 
-    A step of the last burn adds to the velocity what gravity and drag do, and exhaust ln(m before / m after) along the
-    direction flown (Tsiolkovsky). So the ratio of the masses, flow over mass and thrust over mass follow from r, v and
-    the exhaust velocity (m/s, one or (n,)). Drag is the nominal one: where the last stage is lit little is left of it.
-    The first mass of the burn is the flight computer's, which nothing measures. What it is off by makes thrust and flow
-    wrong in the same proportion, and the directions of a plan depend on neither, but on their ratio to the mass.
+    In a step of the last burn gravity and drag change the velocity. The engine adds exhaust ln(m before / m after)
+    along the direction flown (Tsiolkovsky). So the ratio of the masses, flow over mass and thrust over mass follow from
+    r, v and the exhaust velocity (m/s, one or (n,)). The drag is the nominal one, which is small where the last stage
+    is lit.
+
+    The first mass of the burn is the flight computer's, because nothing measures it. Its error makes thrust and flow
+    wrong in the same proportion. The directions of a plan do not depend on this, only on the ratios to the mass.
     """
 
     def __init__(self, rocket: Rocket, exhaust, n: int):
         super().__init__(rocket, n)
         self.exhaust = np.broadcast_to(exhaust, n)
-        self.y = np.zeros((n, 7))  # a step ago
+        self.y = np.zeros((n, 7))  # the states a step ago
         self.was_lit = np.zeros(n, dtype=bool)
 
     def update(self, obs, u, is_lit):
@@ -363,7 +390,7 @@ class MeasuredEngine(NominalEngine):
         self.y, self.was_lit = y, is_lit
 
     def _fall(self, y) -> np.ndarray:
-        """What gravity and drag have added to the velocity in the last step, (n, 3) m/s, by Simpson's rule."""
+        """The velocity (n, 3) in m/s that gravity and drag added in the last step, by Simpson's rule."""
         dt = self.rocket.dt
         middle = (self.y + y) / 2
         middle[:, :3] += (self.y - y)[:, 3:6] * dt / 8  # of the cubic through r and v at both ends
@@ -377,11 +404,11 @@ class MeasuredEngine(NominalEngine):
 
 REPLAN_EVERY = 20.0  # s
 LAST_REPLAN = 20.0  # s before the planned cut-off, after which the last plan is flown open loop
-CHANGE = 0.03  # of the measured flow, at which a flight is replanned at once: no drawn engine differs by so much
-SURE = 6.0  # standard deviations
-SHORTEST = 4.0  # s, of such a plan: a shorter one has two held directions
-LONGEST = 3.0  # times the nominal flight, of the table of directions: an engine may have lost half of its thrust
-REPLAN_INTERVALS = 8  # of collocation: 12 change the final mass by less than 1e-7 kg
+CHANGE = 0.03  # relative change of the measured flow that is replanned at once, more than any drawn engine differs by
+SURE = 6.0  # standard deviations of the noise that are no such change
+SHORTEST = 4.0  # s, the shortest such plan, which has two held directions
+LONGEST = 3.0  # the length of the table of directions, in nominal flights; an engine may have lost half of its thrust
+REPLAN_INTERVALS = 8  # collocation intervals; 12 change the final mass by less than 1e-7 kg
 
 
 def optimum_guess(env_id: str) -> dict:
@@ -396,21 +423,21 @@ def guess_of(flight: dict) -> dict:
 
 
 def middles(rocket: Rocket):
-    """The middles (s) of the steps of `LONGEST` times the longest nominal flight: some vehicles burn longer."""
+    """The middles (s) of the steps of `LONGEST` nominal flights, because some vehicles burn longer."""
     return rocket.dt * (np.arange(np.ceil(LONGEST * rocket.end_time / rocket.dt)) + 0.5)
 
 
 def directions_at(plan: dict, times):
-    """A plan's directions (m, 3) at `times` (m,) in s, those at its end after it."""
+    """A plan's directions (m, 3) at `times` (m,) in s. After its end they stay as they are there."""
     from scipy.interpolate import CubicSpline
 
     return CubicSpline(plan["t_u"], plan["u"])(np.minimum(times, plan["final_time"]))
 
 
 def replan_one(job):
-    """The plan of one flight, None where IPOPT finds none, and its seconds on one core.
+    """The plan of one flight, or None if IPOPT finds none, and the seconds that it took on one core.
 
-    job: (rocket, remaining ascent, guess).
+    job is (rocket, remaining ascent, guess).
     """
     rocket, remaining, guess = job
     remaining_solver(rocket, 0, REPLAN_INTERVALS)  # built before the clock runs
@@ -423,29 +450,36 @@ def replan_one(job):
 
 
 class Replanning:
-    """What launchers do, as a policy: open loop until the last stage has been lit, then explicit guidance.
+    """The law that launchers fly: open loop until the last stage is lit, then explicit guidance.
 
-    Every `REPLAN_EVERY` seconds the remaining ascent is solved again from the r, v observed, for the orbit of the
-    target with the least propellant; its directions are flown until the next plan, and those of the last plan until
-    the cut-off. Where IPOPT fails, the last plan is kept.
+    Every `REPLAN_EVERY` seconds the remaining ascent to the target orbit is solved again from the observed r and v, for
+    the least propellant. Its directions are flown until the next plan, and those of the last plan until the cut-off. If
+    IPOPT fails, the last plan is kept.
 
-    With an `exhaust` velocity (m/s, one or one a flight) thrust, flow and mass are those of `MeasuredEngine`, as
-    launchers correct theirs by the acceleration that they measure. The last burn then ends at the latest where the
-    propellant that is left is burnt at the measured flow. Where that flow is off the plan's by `CHANGE`, an engine has
-    failed: the flight is replanned at once. Without it they are the nominal ones and the flight computer's mass.
-    With navigation noise a step's change of velocity is off, and so is the flow: what `velocity_noise` (m/s) makes of
-    it once in a billion steps is no failure.
-    On 60 draws of eval seed 1, others than the reported ones, p95 of ||error|| was 0.00012 with the nominal ones;
-    replanned until 30 or 40 s before the cut-off 0.00014 and 0.00026, every 10 s until 10 s 0.00004, every 4 s until
-    10 s 0.00002.
+    Without `exhaust` the plans have the nominal engine and the flight computer's mass. With an `exhaust` velocity (m/s,
+    one or one a flight) they have the thrust, flow and mass of `MeasuredEngine`. Launchers correct their engine's
+    numbers by the measured acceleration in the same way. The last burn then ends at the latest when the propellant is
+    burnt at the measured flow. If that flow differs from the plan's by `CHANGE`, an engine has failed, and the flight
+    is replanned at once. Navigation noise of `velocity_noise` (m/s) disturbs the measured flow. A difference that this
+    noise makes once in a billion steps counts as no failure.
 
-    Solves are shared out to `processes`, which changes only the time. `failed` and `seconds` (one a solve) are counted
-    from its making on.
+    `processes` share the solves, which changes only the time. `failed` counts the solves without a plan. `seconds` has
+    one number for each solve.
+
+    On 60 draws of eval seed 1, which are not the reported ones, p95 of ||error|| with the nominal engine was:
+
+        replanned every 20 s, until 20 s before the cut-off    0.00012
+                        20 s,       30 s                       0.00014
+                        20 s,       40 s                       0.00026
+                        10 s,       10 s                       0.00004
+                         4 s,       10 s                       0.00002
     """
 
     def __init__(self, env_id: str, processes: int = 1, exhaust=None, velocity_noise: float = 0.0):
         self.velocity_noise = velocity_noise
-        self.rocket, self.guess, self.open_loop = ROCKETS[env_id].rocket, optimum_guess(env_id), open_loop(env_id)
+        self.rocket = ROCKETS[env_id].rocket
+        self.guess = optimum_guess(env_id)
+        self.open_loop = open_loop(env_id)
         self.exhaust = exhaust
         self.middles = middles(self.rocket)
         self.target = target_orbit(self.rocket.target, self.rocket.mu)
@@ -484,7 +518,7 @@ class Replanning:
         return self.u[:, min(t, len(self.middles) - 1)]
 
     def _replan(self, obs, t, flights):
-        """New plans from step t on for some of the flights of obs (m, 9)."""
+        """Make new plans from step t on for the chosen flights, indices of obs (m, 9)."""
         now = self.rocket.dt * t
         jobs = [(self.rocket, self._remaining_ascent(obs[k], now, k), self.plans[k]) for k in flights]
         self.planned_flow[flights] = self.engine.flow[flights]
@@ -497,7 +531,7 @@ class Replanning:
             self.u[k, t:] = directions_at(plan, self.middles[t:])
 
     def _remaining_ascent(self, obs, now: float, k: int) -> RemainingAscent:
-        """What is left of the last burn at `now` (s) of flight k, of obs (9,)."""
+        """What is left of the last burn of flight k at `now` (s), when obs (9,) is observed."""
         mass, thrust, flow = self.engine.mass[k], self.engine.thrust[k], self.engine.flow[k]
         burn_out = now + (mass - self.rocket.dry_mass) / flow
         end, thrust, flow, mass = (np.array([value]) for value in (burn_out, thrust, flow, mass))
@@ -508,11 +542,11 @@ class Replanning:
 # The optimum of each flight's own vehicle and air: it knows the draw
 # ---------------------------------------------------------------------------------------------------------------------
 
-DRAWN_SEGMENTS = 40  # of collocation: the nominal optimum's mass is then within 1e-4 kg of 80
+DRAWN_SEGMENTS = 40  # collocation intervals; the nominal optimum's mass is within 1e-4 kg of that with 80
 
 
 def drawn_ascent(rocket: Rocket, dispersion: float, z, orbit) -> RemainingAscent:
-    """All of the ascent of the vehicle and air drawn by z (k,), to the orbit (h, e)."""
+    """The whole ascent of the vehicle and air that z (k,) draws, to the orbit (h, e)."""
     vehicle = draw_vehicles(rocket, dispersion, np.asarray(z)[None])
     end = np.append(vehicle.end[: len(rocket.burns) - 1, 0], vehicle.burn_out)
     thrust, flow, dropped = (column[: len(end), 0] for column in (vehicle.thrust, vehicle.flow, vehicle.dropped))
@@ -524,14 +558,14 @@ def drawn_ascent(rocket: Rocket, dispersion: float, z, orbit) -> RemainingAscent
 
 
 def drawn_intervals(rocket: Rocket, end: float) -> tuple[int, ...]:
-    """How many intervals of collocation each burn has in a flight that lasts until about `end` (s)."""
+    """The number of collocation intervals in each burn of a flight that lasts until about `end` (s)."""
     ends = np.append([burn.end for burn in rocket.burns[:-1]], end)
     parts = np.diff(ends, prepend=0.0) / ends[-1]
     return tuple(max(round(DRAWN_SEGMENTS * part), 1) for part in parts)
 
 
 def solve_drawn(job):
-    """The optimum of one flight, None where IPOPT finds none: job is (rocket, dispersion, z, orbit, guess)."""
+    """The optimum of one flight, or None if IPOPT finds none. job is (rocket, dispersion, z, orbit, guess)."""
     rocket, dispersion, z, orbit, guess = job
     intervals = drawn_intervals(rocket, guess["t"][-1])
     try:
@@ -541,10 +575,10 @@ def solve_drawn(job):
 
 
 def drawn_optima(env_id: str, dispersion: float, z, reached=None, processes: int = 1) -> list:
-    """The optima that know their draws z (n, k): what `optimise_remaining` returns, None where IPOPT finds none.
+    """The optima that know their draws z (n, k), as `optimise_remaining` returns them; None if IPOPT finds none.
 
-    To the target, or to the orbits of the states `reached` (n, 6 or more). No guidance law that ends on that orbit
-    has more mass left, whatever it knows.
+    They end on the target orbit, or on the orbits of the states `reached` (n, 6 or more). No guidance law that ends on
+    such an orbit has more mass left, whatever it knows.
     """
     rocket, guess = ROCKETS[env_id].rocket, optimum_guess(env_id)
     orbits = [target_orbit(rocket.target, rocket.mu)] * len(z)
@@ -556,9 +590,10 @@ def drawn_optima(env_id: str, dispersion: float, z, reached=None, processes: int
 
 
 def fly_optima(env_id: str, optima: list, directions_at=directions_at):
-    """The guidance that flies each of the m flights by its own optimum, open loop, by the nominal one where it is None.
+    """The law that flies each of the m flights by its own optimum, open loop. Without one it flies the nominal optimum.
 
-    It knows the draw: it is flown to see that the optima's mass can be reached. `directions_at` is that of the optima.
+    The law knows the draws. It is flown to show that the optima's mass can be reached. `directions_at(optimum, times)`
+    gives an optimum's directions.
     """
     nominal, times = open_loop(env_id), middles(ROCKETS[env_id].rocket)
     u = [directions_at(optimum, times) if optimum else None for optimum in optima]

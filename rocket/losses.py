@@ -1,8 +1,9 @@
-"""What each law saves by the size of the loss, and the laws beside one another on the same flights.
+"""What each law saves, by the size of the loss of thrust, and comparisons of two laws on the same flights.
 
-Flights are told apart by the share of thrust that they lose. Of each group a law has its share saved, the error, and
-the kilograms that it is short of the optimum that knows of the failure from its strike on. Two laws that flew the same
-draws are compared flight by flight: the interval is that of the mean of the differences (Student's t).
+Flights are grouped by the share of thrust that they lose. For each group a law has the share of flights that it saves,
+its errors, and the kilograms that it is short of the optimum which knows of the failure from its strike on. Two laws
+that flew the same draws are compared flight by flight. The interval is that of the mean difference (Student's t).
+
 Reading order: groups, one law, two laws, the report, the printed tables.
 """
 
@@ -15,7 +16,7 @@ import numpy as np
 from rocket.metrics import SUCCESS
 
 EDGES = (0.0, 0.05, 0.10, 0.20, 0.25, 0.30)  # shares of thrust lost
-LARGE = 0.15  # above it, knowing of a failure beforehand is worth most
+LARGE = 0.15  # share of thrust lost, above which it helps most to know of a failure beforehand
 STANDARD = "replan_measured"  # the law that the others are compared with
 CONFIDENCE = 0.95
 
@@ -24,17 +25,17 @@ class Ends(NamedTuple):
     """How the first n of a law's flights ended, (n,) each."""
 
     error: np.ndarray  # ||error||
-    short: np.ndarray  # kg less than the optimum has in the orbit reached; NaN where none is known
+    short: np.ndarray  # kg less than the optimum has in the orbit reached; NaN without a known optimum
 
     @classmethod
     def of(cls, arrays: dict, name: str) -> Ends:
-        """Those of a law among the arrays of `Comparison.flights_by_loss`."""
+        """The ends of the law `name`, from the arrays of `Comparison.flights_by_loss`."""
         short = arrays[f"{name}_mass_reached_kg"] - arrays[f"{name}_final_mass_kg"]
         return cls(arrays[f"{name}_error_norm"], short)
 
     @property
     def saved(self) -> np.ndarray:
-        """Which flights reached the orbit."""
+        """The flights (n,) that reached the orbit, as a mask."""
         return self.error < SUCCESS
 
 
@@ -44,11 +45,12 @@ class Ends(NamedTuple):
 
 
 def groups(failure: np.ndarray, largest: float) -> dict[str, np.ndarray]:
-    """Label -> which of the flights (n,) lose that share of thrust; failure (n, 3) as in `final_info`.
+    """{label: mask (n,) of the flights that lose this share of thrust}, for failure (n, 3) as in `final_info`.
 
-    largest: the greatest share that is drawn. Healthy flights come first, those above `LARGE` last.
+    largest is the greatest share that is drawn. Healthy flights come first, those that lose more than `LARGE` last.
     """
-    has_failed, lost = failure[:, 0] >= 0, failure[:, 2]
+    has_failed = failure[:, 0] >= 0
+    lost = failure[:, 2]
     found = {"0": ~has_failed}
     for low, high in zip(EDGES, EDGES[1:]):
         if low < largest:
@@ -60,7 +62,7 @@ def groups(failure: np.ndarray, largest: float) -> dict[str, np.ndarray]:
 
 
 def savable_flights(arrays: dict) -> np.ndarray:
-    """Which flights (n,) can reach the orbit: the healthy ones, and those whose optimum ends above the dry mass."""
+    """The flights (n,) that can reach the orbit: healthy ones, and those whose optimum ends above the dry mass."""
     is_healthy = arrays["failure"][:, 0] < 0
     return is_healthy | (arrays["best_mass_kg"] > arrays["dry_mass_kg"])
 
@@ -71,9 +73,10 @@ def savable_flights(arrays: dict) -> np.ndarray:
 
 
 def summary(ends: Ends, savable: np.ndarray) -> dict:
-    """A law on the flights `savable` (n,) of a group; without a flight nothing but their number.
+    """A law's numbers on the flights `savable` (n,) of a group. Without such a flight only their number, 0.
 
-    `short_mean_kg` is of those that it saved and whose optimum is known, `short_flights` of them.
+    `short_mean_kg` is the mean over the flights that the law saved and whose optimum is known. `short_flights` is the
+    number of these flights.
     """
     flights = int(savable.sum())
     if not flights:
@@ -90,7 +93,7 @@ def summary(ends: Ends, savable: np.ndarray) -> dict:
 
 
 def paired(ends: Ends, others: Ends, savable: np.ndarray) -> dict:
-    """A law less another on the same flights `savable` (n,): the share saved, and kilograms where both saved."""
+    """One law minus another on the same flights `savable` (n,): the share saved, and kg where both laws saved."""
     share = ends.saved[savable].astype(float) - others.saved[savable]
     both = savable & ends.saved & others.saved
     heavier = (others.short - ends.short)[both]
@@ -101,7 +104,7 @@ def paired(ends: Ends, others: Ends, savable: np.ndarray) -> dict:
 
 
 def mean_interval(values: np.ndarray, name: str) -> dict:
-    """`<name>_flights`, and of their mean the value and its interval, by Student's t: none below two values."""
+    """`<name>_flights`, and the mean of the values with its interval by Student's t, if there are two or more."""
     found = {f"{name}_flights": len(values)}
     if len(values) < 2:
         return found
@@ -118,10 +121,10 @@ def mean_interval(values: np.ndarray, name: str) -> dict:
 
 
 def loss_report(arrays: dict, names: list[str], largest: float) -> dict:
-    """By the label of a group what each law does: `summary`, and `against` the standard law what `paired` has.
+    """{label of a group: {law: its `summary`, and `against`, which is `paired` with the standard law}}.
 
-    arrays: those of `Comparison.flights_by_loss`. A law is measured on all that it flew, and compared on the first
-    flights, which both flew.
+    arrays are those of `Comparison.flights_by_loss`. A law is measured on all its flights. It is compared on the first
+    flights, which both laws flew.
     """
     savable = savable_flights(arrays)
     laws = {name: Ends.of(arrays, name) for name in names}
@@ -132,8 +135,9 @@ def loss_report(arrays: dict, names: list[str], largest: float) -> dict:
         for name, ends in laws.items():
             rows[name] = summary(ends, (group & savable)[: len(ends.error)])
             both = min(len(ends.error), len(standard.error))
-            first, others = (Ends(*(values[:both] for values in law)) for law in (ends, standard))
             if name != STANDARD:
+                first = Ends(ends.error[:both], ends.short[:both])
+                others = Ends(standard.error[:both], standard.short[:both])
                 rows[name]["against"] = paired(first, others, (group & savable)[:both])
         report[label] = rows
     return report
@@ -148,7 +152,7 @@ WIDTHS = (7, 7, 16, 8, 10, 22, 24)
 
 
 def loss_lines(report: dict) -> list[str]:
-    """`loss_report` in lines: a table for each group of flights."""
+    """The lines of `loss_report`: a table for each group of flights."""
     lines = ["By the share of thrust lost: of the savable flights, and beside them less " + STANDARD]
     lines.append("  on the flights that both flew, with 95 % intervals (paired, Student's t)")
     for label, laws in report.items():
@@ -160,7 +164,7 @@ def loss_lines(report: dict) -> list[str]:
 
 
 def law_cells(law: dict) -> str:
-    """A law's cells."""
+    """A law's cells in one line."""
     if not law["savable"]:
         return f"  {0:>{WIDTHS[0]}}"
     short = f"{law['short_mean_kg']:.2f}" if "short_mean_kg" in law else "-"
@@ -171,7 +175,7 @@ def law_cells(law: dict) -> str:
 
 
 def interval(found: dict, name: str, factor: float, form: str) -> str:
-    """A difference with its interval, "-" where there is none."""
+    """A difference with its interval, or "-" without one."""
     if name not in found:
         return "-"
     mean, low, high = (format(factor * found[f"{name}{part}"], f"+{form}") for part in ("", "_low", "_high"))

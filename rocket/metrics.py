@@ -1,8 +1,8 @@
-"""What a rocket's flights are measured by: elements, altitudes, mass; and statistics of flights that differ.
+"""The metrics of a rocket's flights: orbital elements, altitudes and mass of one, statistics of flights that differ.
 
-One start and a deterministic policy: one nominal flight says everything. Dispersed flights have each its own vehicle
-and air, some a failure, so that a policy is measured by statistics. The names of all metrics (eval.json) are the
-project's interface.
+The nominal rocket has one start and the policy is deterministic, so one flight says everything. Each dispersed flight
+has its own vehicle and air, and some have a failure, so statistics measure a policy there. The names of all metrics
+(eval.json) are the project's interface.
 """
 
 from __future__ import annotations
@@ -22,15 +22,16 @@ from rocket.navigation import flight_noise
 from rocket.orbits import orbital_elements
 from rocket.vehicle import Rocket
 
-SUCCESS = 0.02  # of the error's norm: ours; the paper pays for a "successful orbital insertion" and gives no bound
+SUCCESS = 0.02  # bound of ||error||, our choice: the paper's "successful orbital insertion" has no bound
 ELEMENT_ERRORS = {"a_km": "a_error_km", "e": "e_error", "i_deg": "i_error_deg"}
 ELEMENT_ERRORS |= {"raan_deg": "raan_error_deg", "argp_deg": "argp_error_deg"}
 EQUATORIAL = (0.0, 180.0)  # inclinations in degrees at which an orbit has no node
 
 
 def rocket_metrics(flight: dict, reference: dict, mission: Mission) -> dict:
-    """The metrics of a flight of `fly_rocket` beside the optimum's, `rocket_reference`."""
-    metrics, best = (flight_summary(flown, mission) for flown in (flight, reference))
+    """The metrics of a flight of `fly_rocket`, beside those of the optimum, `rocket_reference`."""
+    metrics = flight_summary(flight, mission)
+    best = flight_summary(reference, mission)
     target = target_summary(mission.rocket)
     for key, error in ELEMENT_ERRORS.items():
         if key in target:
@@ -44,7 +45,10 @@ def rocket_metrics(flight: dict, reference: dict, mission: Mission) -> dict:
 
 
 def flight_summary(flight: dict, mission: Mission) -> dict:
-    """What is said of ours and of the optimum alike: elements, altitudes (km above Re), mass, time, return."""
+    """The metrics that the policy's flight and the optimum's both have: elements, altitudes, mass, time, return.
+
+    Altitudes are in km above Re.
+    """
     keys = ("error_norm", *ELEMENT_ERRORS, "final_mass_kg", "final_time_s", "max_altitude_km", "episodic_return")
     summary = {key: flight[key] for key in keys} | apsides(flight["a_km"], flight["e"], mission.rocket)
     if mission.rocket.i in EQUATORIAL:
@@ -54,17 +58,17 @@ def flight_summary(flight: dict, mission: Mission) -> dict:
 
 
 def lowest_key(mission: Mission) -> str:
-    """The metric of the lowest altitude after the air has been left, `min_altitude_after_300s_km` by default."""
+    """The name of the metric for the lowest altitude above the air, by default `min_altitude_after_300s_km`."""
     return f"min_altitude_after_{mission.floor_from:.0f}s_km"
 
 
 def perigee_longitude(raan: float, argp: float, i: float) -> float:
-    """The perigee's angle from the x axis in the direction of flight, in degrees as all, where there is no node."""
+    """The perigee's angle from the x axis in the direction of flight, for an orbit without a node. All in degrees."""
     return (argp + (raan if i < 90 else -raan)) % 360.0
 
 
 def apsides(a_km: float, e: float, rocket: Rocket) -> dict:
-    """Altitudes of perigee and apogee above Re in km; a hyperbola (a < 0) has its apogee at infinity."""
+    """Altitudes of perigee and apogee above Re in km. A hyperbola (a < 0) has an infinite apogee."""
     Re = rocket.Re / 1e3
     return {"perigee_km": a_km * (1 - e) - Re, "apogee_km": a_km * (1 + e) - Re if a_km > 0 else np.inf}
 
@@ -75,7 +79,7 @@ def altitude_km(y: np.ndarray, rocket: Rocket) -> np.ndarray:
 
 
 def target_summary(rocket: Rocket) -> dict:
-    """The target orbit in the metrics' names and units, without the angles that a circle or no node leaves open."""
+    """The target orbit in the metrics' names and units. Angles that a circular or equatorial one lacks are left out."""
     target = {"a_km": rocket.a / 1e3, "e": rocket.e, "i_deg": rocket.i, "raan_deg": rocket.raan % 360.0}
     target["argp_deg"] = rocket.argp % 360.0
     if rocket.i in EQUATORIAL:
@@ -86,27 +90,29 @@ def target_summary(rocket: Rocket) -> dict:
 
 
 def wrapped(key: str, difference: float) -> float:
-    """A difference of the metric `key`; of angles in degrees the short way round, -180 to 180."""
-    return (difference + 180.0) % 360.0 - 180.0 if key.endswith("_deg") else difference
+    """A difference of the metric `key`. Angles differ by the short way round, from -180 to 180 degrees."""
+    if not key.endswith("_deg"):
+        return difference
+    return (difference + 180.0) % 360.0 - 180.0
 
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Dispersed flights
 # ---------------------------------------------------------------------------------------------------------------------
 
-# 1705 flights without a failure show a success rate of 99.865 % (3 sigma) at 90 % confidence: the size of NASA's Monte
-# Carlo analyses by order statistics (Hanson and Beard, 2012)
+# If all of 1705 flights succeed, the success rate is at least 99.865 % (3 sigma) with 90 % confidence. NASA's Monte
+# Carlo analyses by order statistics have this size (Hanson and Beard, 2012).
 DISPERSED_STARTS = 1705
-AT_ONCE = 341  # flights of a batch: a fifth, so that the caches of a policy stay below 0.3 GB
-# what the Falcon 9 user's guide gives as its 3 sigma accuracy of insertion into a transfer orbit (from memory)
+AT_ONCE = 341  # flights of a batch, a fifth of all, so that the caches of a policy stay below 0.3 GB
+# 3 sigma accuracy of insertion into a transfer orbit by the Falcon 9 user's guide, quoted from memory
 BOX = {"perigee_km": 10.0, "apogee_km": 500.0, "i_deg": 0.1, "raan_deg": 0.1, "argp_deg": 0.3}
 
 
 def draws(rocket: Rocket, dispersion: float, eval_seed: int, n: int, failure: float = 0.0) -> np.ndarray:
-    """The n draws (n, k) of a seed, standard scores: the same for every policy and guidance law.
+    """The n draws (n, k) of a seed, in standard scores. They are the same for every policy and guidance law.
 
-    Clipped as the environment's own: at 3, earlier where a dispersion is so large that no such vehicle can be. With a
-    `failure` (n, k + 4): behind the same scores the flights' failures, the same ones whatever its size.
+    They are clipped as in the environment (`draw_bounds`). With a `failure` they are (n, k + 4): the same scores, then
+    the failures. The failures' numbers are the same for every size of `failure`.
     """
     bounds = draw_bounds(rocket, dispersion)
     scores = np.random.default_rng([eval_seed, 2]).standard_normal((n, len(bounds))).clip(-bounds, bounds)
@@ -116,12 +122,14 @@ def draws(rocket: Rocket, dispersion: float, eval_seed: int, n: int, failure: fl
 
 
 def healthy(arrays: dict) -> np.ndarray:
-    """Which of the flights of `evaluate_dispersed`'s arrays have no failure, (n,)."""
-    return arrays["failure"][:, 0] < 0 if "failure" in arrays else np.ones(len(arrays["draw"]), dtype=bool)
+    """The flights (n,) without a failure, as a mask, in the arrays of `evaluate_dispersed`."""
+    if "failure" not in arrays:
+        return np.ones(len(arrays["draw"]), dtype=bool)
+    return arrays["failure"][:, 0] < 0
 
 
 def chosen(arrays: dict, flights: np.ndarray) -> dict:
-    """The arrays (n, ...) of some of the flights (n,)."""
+    """The arrays (n, ...) of the chosen flights, a mask or indices."""
     return {key: value[flights] for key, value in arrays.items()}
 
 
@@ -130,12 +138,14 @@ def evaluate_dispersed(
 ):
     """Fly `policy(obs (m, obs), t) -> action (m, 3)` on the first n draws of a seed, in batches of at most `at_once`.
 
-    Returns the `dispersed_...` metrics of eval.json and the arrays `draw` (n, k), `final_y` (n, 7) with the true mass,
-    `final_t` (n,), `final_error` (n, 6). Flights that crash or run dry are counted, and are among the errors. With the
-    option `failure` also the array `failure` (n, 3), as in `final_info`; the metrics are then of the healthy flights.
+    Returns the `dispersed_...` metrics of eval.json, and the arrays `draw` (n, k), `final_y` (n, 7) with the true mass,
+    `final_t` (n,) and `final_error` (n, 6). Flights that crash or run dry are counted, and the errors include them.
+    With the option `failure` there is an array `failure` (n, 3) as in `final_info`, and the metrics are those of the
+    healthy flights.
     """
     rocket = env_options.get("rocket") or ROCKETS[env_id].rocket
-    z, parts = draws(rocket, dispersion, eval_seed, n, env_options.get("failure", 0.0)), []
+    z = draws(rocket, dispersion, eval_seed, n, env_options.get("failure", 0.0))
+    parts = []
     for first in range(0, n, at_once):
         batch = range(first, min(first + at_once, n))
         noise = partial(flight_noise, eval_seed, batch)
@@ -143,43 +153,53 @@ def evaluate_dispersed(
     flights = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
     names = ("final_y", "final_t", "final_error", "failure")
     arrays = {"draw": z} | {key: flights[key] for key in names if key in flights}
-    if not dispersion:  # healthy flights are then all alike
+    if not dispersion:  # all healthy flights are equal
         return {}, arrays
     flights = chosen(flights, healthy(arrays))
     metrics = {"dispersion": float(dispersion), "dispersed_starts": len(flights["error"])}
-    return metrics | (dispersed_metrics(flights, rocket) if len(flights["error"]) else {}), arrays
+    if len(flights["error"]):
+        metrics |= dispersed_metrics(flights, rocket)
+    return metrics, arrays
 
 
 def fly_dispersed(env_id: str, policy, z: np.ndarray, dispersion: float, noise=None, **env_options) -> dict:
     """The ends of one batch of flights with the draws z (m, k): `final_info`'s arrays, `final_y` (m, 7) and others.
 
-    noise(T): the standard scores (m, T, 6) of the observations, with the option `navigation_noise`; else random.
+    noise(T) gives the standard scores (m, T, 6) of the observations, with the option `navigation_noise`. Without it the
+    scores are random.
     """
     batch: Any = gym.make_vec(env_id, num_envs=len(z), dispersion=dispersion, **env_options)
     given = {"draw": z}
     if noise is not None and batch.navigation_noise:
         given["noise"] = noise(batch.episode_steps + 1)
     obs, _ = batch.reset(options=given)
-    alive, ends, t = np.ones(len(z), dtype=bool), {}, 0
+    alive = np.ones(len(z), dtype=bool)
+    ends = {}
+    t = 0
     while alive.any():
         obs, _, terminated, _, info = batch.step(policy(obs, t))
-        ended, t = alive & terminated, t + 1  # an ended environment has started anew; its first flight counts
+        ended = alive & terminated  # an ended environment starts a new flight, which does not count
+        t += 1
         if ended.any():
-            # with navigation noise what is observed is not the state, and the info has it
+            # with navigation noise the observation is not the state, and `final_info` has the state as final_y
             final = {"final_y": info["final_obs"][:, :7], **info["final_info"]}
             for key, value in final.items():
                 ends.setdefault(key, np.zeros_like(value))[ended] = value[ended]
         alive = alive & ~terminated
-    ends["final_y"][:, 6] = ends["final_mass_kg"]  # what is observed is the flight computer's
+    ends["final_y"][:, 6] = ends["final_mass_kg"]  # the observed mass is the flight computer's
     return ends | {"final_t": ends["final_time_s"], "final_error": ends["error"]}
 
 
 def dispersed_metrics(flights: dict, rocket: Rocket) -> dict:
-    """The statistics of dispersed flights (n,): errors of all, elements of those that reached a closed orbit."""
+    """The statistics of dispersed flights (n,): errors of all, elements of those that reached a closed orbit.
+
+    flights has `error_norm` and the elements, masses and ends of `final_info`.
+    """
     errors = flights["error_norm"]
     metrics = {"dispersed_error_median": np.median(errors), "dispersed_error_max": errors.max()}
     metrics |= {f"dispersed_error_p{p}": np.percentile(errors, p) for p in (95, 99)}
-    misses, closed = element_misses(flights, rocket), (flights["a_km"] > 0) & ~flights["crashed"]
+    misses = element_misses(flights, rocket)
+    closed = (flights["a_km"] > 0) & ~flights["crashed"]
     for key, miss in misses.items():
         name, unit = key.rsplit("_", 1)
         if closed.any():
@@ -194,20 +214,21 @@ def dispersed_metrics(flights: dict, rocket: Rocket) -> dict:
 
 
 def savable_flights(arrays: dict, best_mass: np.ndarray, dry_mass: np.ndarray) -> np.ndarray:
-    """The flights (n,) that lose thrust and could yet reach their orbit.
+    """The flights (n,), as a mask, that lose thrust and can still reach their orbit.
 
-    best_mass (n,) kg: what the optimum has left in the target orbit that knows of the failure from its strike on, its
-    dry mass relaxed (`rescue.py`; NaN where none was found). A flight is savable where that is above dry_mass (n,) kg.
+    best_mass (n,) in kg is what is left in the target orbit by the optimum that knows of the failure from its strike
+    on, with a relaxed dry mass (`rescue.py`). It is NaN if no optimum was found. A flight is savable if its best_mass
+    is above its dry_mass (n,) in kg.
     """
     return ~healthy(arrays) & (best_mass > dry_mass)
 
 
 def failure_metrics(arrays: dict, best_mass: np.ndarray, mass_reached: np.ndarray, dry_mass: np.ndarray) -> dict:
-    """The statistics of the flights with a failure, of n flights as `evaluate_dispersed` returns their arrays.
+    """The statistics of the flights with a failure, from the arrays that `evaluate_dispersed` returns for n flights.
 
-    best_mass and dry_mass (n,) kg: see `savable_flights`. Errors and the rate are of the savable flights. The mass that
-    is short is that of the saved flights, beside mass_reached (n,) kg, what the same optimum has left in the orbit that
-    the flight reached.
+    best_mass and dry_mass (n,) in kg are those of `savable_flights`. Errors and the saved rate are those of the savable
+    flights. The missing mass is that of the saved flights, beside mass_reached (n,) in kg: what the same optimum has
+    left in the orbit that the flight reached.
     """
     has_failed = ~healthy(arrays)
     savable = savable_flights(arrays, best_mass, dry_mass)
@@ -225,8 +246,12 @@ def failure_metrics(arrays: dict, best_mass: np.ndarray, mass_reached: np.ndarra
 
 
 def element_misses(flights: dict, rocket: Rocket) -> dict:
-    """What flights miss the target by, (n,) each, in the order of `BOX`: km and degrees, only angles that it has."""
-    target, flown = target_summary(rocket), {key: flights[key] for key in ("i_deg", "raan_deg", "argp_deg")}
+    """The differences (n,) of flights from the target, in the order of `BOX`, in km and degrees.
+
+    An angle that the target does not have is left out.
+    """
+    target = target_summary(rocket)
+    flown = {key: flights[key] for key in ("i_deg", "raan_deg", "argp_deg")}
     if rocket.i in EQUATORIAL:
         flown["argp_deg"] = perigee_longitude(flown["raan_deg"], flown["argp_deg"], rocket.i)
     a, e, Re = flights["a_km"], flights["e"], rocket.Re / 1e3
@@ -235,7 +260,7 @@ def element_misses(flights: dict, rocket: Rocket) -> dict:
 
 
 def box_rate(inside: int, n: int) -> dict:
-    """The share of flights inside the launcher's accuracy, and its Wilson interval at 95 % confidence."""
+    """The share of n flights inside the launcher's accuracy, and its Wilson interval at 95 % confidence."""
     from scipy.stats import binomtest
 
     interval = binomtest(inside, n).proportion_ci(0.95, method="wilson")
@@ -254,7 +279,7 @@ def final_elements(y: np.ndarray, rocket: Rocket) -> dict:
 
 
 def decision_us(env_id: str, policy, **env_options) -> float:
-    """Median microseconds on one core of a policy's decision, over a flight that is alone in its batch."""
+    """The median time in microseconds, on one core, of a policy's decision in a flight that is alone in its batch."""
     seconds = []
 
     def timed(obs, t):

@@ -1,6 +1,7 @@
-"""The noise of navigation: what is observed of position and velocity is off, afresh in each step.
+"""Navigation noise: the observed position and velocity differ from the true ones by new random numbers in each step.
 
-White and normal, the same in the three components. Physics, events and the cut-off know the exact state.
+The noise is white and normal, and its three components have the same standard deviation. Physics, events and the
+cut-off have the exact state.
 """
 
 from __future__ import annotations
@@ -13,13 +14,13 @@ from common.errors import is_finite, refuse_unless
 
 OBSERVED = 6  # r and v
 LARGEST_NOISE = 1e4  # m and m/s
-LARGEST_SCORE = 10.0  # standard deviations that no normal number of NumPy's exceeds
-NOMINAL_FLIGHT = 10**6  # its number among the flights of an evaluation, which has no more others
+LARGEST_SCORE = 10.0  # standard deviations, which no normal number of NumPy exceeds
+NOMINAL_FLIGHT = 10**6  # the nominal flight's number in an evaluation; all other flights have smaller numbers
 ALLOWED = f"must be two numbers from 0 to {LARGEST_NOISE:g}, standard deviations in m and m/s"
 
 
 def is_noise(value) -> bool:
-    """Whether the option `navigation_noise` can be this: None or 0 for no noise, or two numbers."""
+    """Whether `value` can be the option `navigation_noise`: None or 0 for no noise, or two numbers."""
     if value is None or (is_finite(value) and value == 0):
         return True
     if not isinstance(value, list | tuple | np.ndarray) or len(value) != 2:
@@ -28,7 +29,7 @@ def is_noise(value) -> bool:
 
 
 def checked_noise(value) -> tuple[float, float] | None:
-    """The option `navigation_noise` as (m, m/s), None where there is no noise. BadInput where it can be none."""
+    """The option `navigation_noise` as (m, m/s), or None without noise. Raises BadInput if it is neither."""
     refuse_unless(is_noise(value), "navigation_noise", repr(value), ALLOWED)
     if value is None or not np.any(value):
         return None
@@ -42,16 +43,16 @@ def deviations(noise: tuple[float, float] | None) -> np.ndarray:
 
 
 def flight_noise(eval_seed: int, flights: Iterable[int], steps: int) -> np.ndarray:
-    """Standard scores (m, steps, 6) of these flights of a seed: for every policy and law the same.
+    """Standard scores (m, steps, 6) of m flights of a seed. They are the same for every policy and law.
 
-    Neither the other flights of a batch nor its number of steps change a flight's.
+    A flight's scores do not depend on the other flights or on the number of steps.
     """
     streams = (np.random.default_rng([eval_seed, 6, flight]) for flight in flights)
     return np.stack([stream.standard_normal((steps, OBSERVED)) for stream in streams])
 
 
 def noise_metrics(noise) -> dict:
-    """The keys of eval.json; none without noise."""
+    """The noise's entries of eval.json. There are none without noise."""
     checked = checked_noise(noise)
     if checked is None:
         return {}

@@ -1,7 +1,7 @@
-"""Reference optima of the rockets: one nonlinear program, solved by IPOPT, then flown by the environment.
+"""Reference optima of the rockets: one nonlinear program, solved by IPOPT and then flown by the environment.
 
-Reading order: the program (what is solved, its meshes, collocation, the solve), the references that the environments
-fly. CasADi and SciPy are imported only where they are used: a stored reference needs neither.
+Reading order: the program (what is solved, its meshes, collocation, the solve), then the references that the
+environments fly. CasADi and SciPy are imported only where they are used. A stored reference needs neither.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ from rocket.vehicle import ROCKET, Rocket, delta_v, launch_raan
 # ---------------------------------------------------------------------------------------------------------------------
 
 SEGMENTS = 80
-MAX_ITERATIONS = 150  # an ascent that exists took 18 to 42; one that does not would take IPOPT's 3000
+MAX_ITERATIONS = 150  # an ascent that exists takes 18 to 42; one that does not would take IPOPT's 3000
 GAUSS_POINTS = (1 + np.polynomial.legendre.leggauss(4)[0]) / 2  # in (0, 1)
 
 
 class AscentCase(NamedTuple):
-    """What is solved: a vehicle, final time free (heaviest) or the table's (least turning), altitude bounds in m."""
+    """What is solved: the ascent of one vehicle."""
 
     key: str
     rocket: Rocket
-    free: bool = True
-    ceiling: float = np.inf
-    floor: float = 1.0  # m
+    free: bool = True  # free final time, for the most mass; else the table's final time, for the least turning
+    ceiling: float = np.inf  # m, upper bound of the altitude
+    floor: float = 1.0  # m, lower bound of the altitude
 
 
 PAPER_CEILING = PAPER_MISSION.ceiling  # the paper penalises an overshoot; the bound is ours
@@ -53,33 +53,37 @@ ASCENTS = {
         AscentCase("free_table_isp", replace(ROCKET, table_isp=True)),
         AscentCase("fixed", ROCKET, free=False),
         AscentCase("fixed_capped", ROCKET, free=False, ceiling=PAPER_CEILING),
-        AscentCase("drag_free", replace(ROCKET, Cd=0.0), floor=5.0),  # else its optimum, held, skims the ground
+        AscentCase("drag_free", replace(ROCKET, Cd=0.0), floor=5.0),  # with a lower floor the flight skims the ground
     )
 }
 
 
 class Mesh(NamedTuple):
-    """Where an ascent is cut into n intervals, at every event at least. Times in s, for the guessed final time."""
+    """An ascent cut into n intervals, at least at every event. Times are in s, for the guessed final time."""
 
     t: np.ndarray  # (n+1,) the intervals' ends
-    stretch: np.ndarray  # (n+1,) how t moves per second of final time
+    stretch: np.ndarray  # (n+1,) how far t moves for each second of final time
     t_u: np.ndarray  # (m,) the times of the thrust directions
-    column: np.ndarray  # which of them the intervals use, in order
-    final_time: tuple[float, float]  # bounds
+    column: np.ndarray  # the indices of the directions that the intervals use, in order
+    final_time: tuple[float, float]  # bounds of the final time
     points: int  # collocation points within an interval
 
 
 def state_scale(rocket: Rocket):
-    """Earth radius and circular speed at it, (6,): in these units r and v are of order 1."""
+    """The units (6,) of r and v: the Earth's radius (m) and the circular speed there (m/s)."""
     return np.repeat([rocket.Re, np.sqrt(rocket.mu / rocket.Re)], 3)
 
 
 def collocation_mesh(case: AscentCase, end: float, segments: int) -> Mesh:
-    """About `segments` intervals of like length, a whole number in each arc; the last arc's stretch with the end."""
+    """About `segments` intervals of like length, a whole number in each arc. The last arc's stretch with the end."""
     arcs = [arc for arc in case.rocket.arcs() if arc[0] < end]
-    start, stop = arcs[-1][0], min(arcs[-1][1], case.rocket.end_time)
-    ends = [min(arc[1], end) for arc in arcs]
-    pieces = [np.linspace(a[0], b, max(round(segments * (b - a[0]) / end), 1) + 1)[1:] for a, b in zip(arcs, ends)]
+    start = arcs[-1][0]
+    stop = min(arcs[-1][1], case.rocket.end_time)
+    pieces = []
+    for arc in arcs:
+        arc_end = min(arc[1], end)
+        intervals = max(round(segments * (arc_end - arc[0]) / end), 1)
+        pieces.append(np.linspace(arc[0], arc_end, intervals + 1)[1:])
     t = np.concatenate([[0.0], *pieces])
     t_u = (t[:-1, None] + np.diff(t)[:, None] * GAUSS_POINTS).ravel()
     stretch = np.clip((t - start) / (end - start), 0.0, 1.0)
@@ -87,9 +91,9 @@ def collocation_mesh(case: AscentCase, end: float, segments: int) -> Mesh:
 
 
 def zero_order_hold_mesh(rocket: Rocket, end: float, free: bool = False) -> Mesh:
-    """The environment's steps until `end`, cut at the events, with one direction each.
+    """The environment's steps until `end`, cut at the events, with one direction for each step.
 
-    With a free end the last interval stretches, within its step and the rocket's time.
+    With a free end the last interval stretches, within its step and up to the rocket's end_time.
     """
     t_u = rocket.dt * np.arange(np.ceil(end / rocket.dt - 1e-9))
     t = np.unique([*t_u, *(arc[1] for arc in rocket.arcs() if arc[1] < end), end])
@@ -105,25 +109,27 @@ def zero_order_hold_mesh(rocket: Rocket, end: float, free: bool = False) -> Mesh
 def collocation(rocket: Rocket, in_wind: bool = False):
     """Interval of Gauss-Legendre collocation: CasADi function (x, z, u, (m, T, flow, dt)) -> (defects, x at the end).
 
-    The scaled r, v are the polynomial through x (6,) at the start and z (6, points) at the Gauss points; a defect is
-    its derivative there minus the dynamics' ("derivative form", e.g. Garg et al., Automatica 46, 2010). With `in_wind`
-    the engine's four numbers are followed by the air's: the factor on the drag, the wind towards east and north (m/s).
+    The scaled r and v follow the polynomial through x (6,) at the start and z (6, points) at the Gauss points. A defect
+    is the polynomial's derivative at a Gauss point minus that of the dynamics ("derivative form", e.g. Garg et al.,
+    Automatica 46, 2010). With `in_wind` three more parameters follow: the factor on the drag, and the wind towards east
+    and north (m/s).
     """
     import casadi as ca
 
     tau = GAUSS_POINTS
     C, D, _ = ca.collocation_coeff(tau)  # derivative at the points, value at the end
     scale = ca.DM(state_scale(rocket))
-    x, z, u = ca.SX.sym("x", 6), ca.SX.sym("z", 6, len(tau)), ca.SX.sym("u", 3, len(tau))
-    mass, thrust, flow, dt = engine = ca.vertsplit(ca.SX.sym("engine", 4))
+    x = ca.SX.sym("x", 6)
+    z = ca.SX.sym("z", 6, len(tau))
+    u = ca.SX.sym("u", 3, len(tau))
+    engine = ca.vertsplit(ca.SX.sym("engine", 4))
+    mass, thrust, flow, dt = engine
     air = ca.vertsplit(ca.SX.sym("air", 3)) if in_wind else []
     drag, *wind = air or [None]
     rates = []
     for j in range(len(tau)):
-        state, control = (
-            (*ca.vertsplit(scale * z[:, j]), mass - flow * tau[j] * dt),
-            (*ca.vertsplit(u[:, j]), thrust, flow),
-        )
+        state = (*ca.vertsplit(scale * z[:, j]), mass - flow * tau[j] * dt)
+        control = (*ca.vertsplit(u[:, j]), thrust, flow)
         rates.append(ca.vertcat(*ascent_dynamics(state, control, rocket, wind or None, drag)[:6]) / scale)
     nodes = ca.horzcat(x, z)
     defects = nodes @ C - dt * ca.horzcat(*rates)
@@ -132,20 +138,23 @@ def collocation(rocket: Rocket, in_wind: bool = False):
 
 
 def zero_order_hold_step(rocket: Rocket):
-    """Interval of multiple shooting, as `collocation` but without points: the environment's step, u held."""
+    """An interval of multiple shooting, with the arguments of `collocation` but no points: the environment's step."""
     import casadi as ca
 
     scale = ca.DM(state_scale(rocket))
-    x, u = ca.SX.sym("x", 6), ca.SX.sym("u", 3)
-    mass, thrust, flow, dt = engine = ca.vertsplit(ca.SX.sym("engine", 4))
-    state, control = (*ca.vertsplit(scale * x), mass), (*ca.vertsplit(u), thrust, flow)
+    x = ca.SX.sym("x", 6)
+    u = ca.SX.sym("u", 3)
+    engine = ca.vertsplit(ca.SX.sym("engine", 4))
+    mass, thrust, flow, dt = engine
+    state = (*ca.vertsplit(scale * x), mass)
+    control = (*ca.vertsplit(u), thrust, flow)
     x_next = rk4(lambda x, u: ascent_dynamics(x, u, rocket), state, control, dt)
     none = ca.SX(6, 0)
     return ca.Function("zoh_step", [x, none, u, ca.vertcat(*engine)], [none, ca.vertcat(*x_next[:6]) / scale])
 
 
 def burning(rocket: Rocket, t):
-    """Thrust (N) and flow (kg/s) from times t (n,) on, the start (s) of that arc and the mass (kg) there, each (n,)."""
+    """Thrust (N) and flow (kg/s) from times t (n,) on, the start (s) of their arc and the mass (kg) then, (n,) each."""
     start, end, thrust, flow, dropped = np.array(rocket.arcs()).T
     mass = rocket.x0[6] - np.append(0.0, np.cumsum(flow * (end - start) + dropped)[:-1])
     arc = np.searchsorted(end, t, side="right")
@@ -153,9 +162,9 @@ def burning(rocket: Rocket, t):
 
 
 def orbit_defect(rocket: Rocket, x, h_target, e_target):
-    """Five independent numbers that are 0 where a state x (r, v; a CasADi symbol) is on the orbit of these vectors.
+    """Five independent numbers that are 0 if a state x (r, v; a CasADi symbol) is on the orbit of these vectors.
 
-    e is normal to h: once h is the target's, two components of e are left, in the plane of the rocket's target.
+    e is normal to h. So when h is the target's, only two components of e are left, in the plane of the rocket's target.
     """
     import casadi as ca
 
@@ -164,17 +173,22 @@ def orbit_defect(rocket: Rocket, x, h_target, e_target):
 
 
 def ascent_program(case: AscentCase, mesh: Mesh):
-    """The nonlinear program as CasADi symbols: unknowns x (6, n) at the intervals' ends, z, u (3, m), final time.
+    """The nonlinear program as CasADi symbols: unknowns x (6, n) at the intervals' ends, z, u (3, m) and final time.
 
-    Minimises the final time (the mass left falls with it), or sum |u_{k+1} - u_k|^2 where that is fixed. Constraints:
-    the defects, x continuous, |u| = 1, the target orbit by five independent numbers (= 0), |r| / Re at x (bounded).
+    It minimises the final time, with which the mass left falls, or sum |u_{k+1} - u_k|^2 if the final time is fixed.
+    The constraints are the defects, a continuous x, |u| = 1, the target orbit (`orbit_defect` = 0), and bounds of
+    |r| / Re at x.
     """
     import casadi as ca
 
-    ca.GlobalOptions.setNumpyMode(1)  # np.exp of a symbol is a symbol, without the warning that it was not always so
-    rocket, n = case.rocket, len(mesh.t) - 1
-    scale, end = state_scale(rocket), ca.MX.sym("end")
-    x, z, u = ca.MX.sym("x", 6, n), ca.MX.sym("z", 6, n * mesh.points), ca.MX.sym("u", 3, len(mesh.t_u))
+    ca.GlobalOptions.setNumpyMode(1)  # np.exp of a symbol is a symbol; without this CasADi warns
+    rocket = case.rocket
+    n = len(mesh.t) - 1
+    scale = state_scale(rocket)
+    end = ca.MX.sym("end")
+    x = ca.MX.sym("x", 6, n)
+    z = ca.MX.sym("z", 6, n * mesh.points)
+    u = ca.MX.sym("u", 3, len(mesh.t_u))
     t = ca.DM(mesh.t).T + (end - mesh.t[-1]) * ca.sparsify(ca.DM(mesh.stretch)).T
     thrust, flow, start, mass = (ca.DM(column).T for column in burning(rocket, mesh.t[:-1]))
     engine = ca.vertcat(mass - flow * (t[:-1] - start), thrust, flow, t[1:] - t[:-1])
@@ -190,22 +204,25 @@ def ascent_program(case: AscentCase, mesh: Mesh):
 
 
 def interpolate(times, t, values):
-    """Columns of `values` (k, d) at t (k,), linearly at `times` (m,): (m, d)."""
+    """The columns of `values` (k, d) at t (k,), interpolated linearly at `times` (m,): (m, d)."""
     return np.column_stack([np.interp(times, t, column) for column in values.T])
 
 
 @interruptible()
 def solve_from_guess(case: AscentCase, mesh: Mesh, guess: dict, clock: SolveClock) -> dict:
-    """Solve `ascent_program` from a guess with t (s), y (its states, at least r and v), t_u (s), u (directions).
+    """Solve `ascent_program` from a guess with t (s), y (states, at least r and v), t_u (s) and u (directions).
 
-    Returns the same of the optimum (y (n+1, 6)), `status`, `final_time`, `final_mass`, and `costate` (m, 3), the
-    multipliers of the velocity defects: in collocation the velocity's costate times the weight of the quadrature.
-    Raises RuntimeError where IPOPT finds no optimum.
+    Returns the same of the optimum, with y (n+1, 6), and `status`, `final_time` (s), `final_mass` (kg) and `costate`
+    (m, 3). `costate` has the multipliers of the velocity defects. In collocation they are the velocity's costate times
+    the weight of the quadrature. Raises NoOptimum if IPOPT finds no optimum.
     """
     import casadi as ca
 
-    rocket, n, points = case.rocket, len(mesh.t) - 1, mesh.points
-    program, scale = ascent_program(case, mesh), state_scale(rocket)
+    rocket = case.rocket
+    n = len(mesh.t) - 1
+    points = mesh.points
+    program = ascent_program(case, mesh)
+    scale = state_scale(rocket)
     options = {"print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.tol": 1e-10}
     options |= {"ipopt.bound_relax_factor": 0, "ipopt.max_iter": MAX_ITERATIONS}
     options |= {"ipopt.max_wall_time": max(clock.seconds_left(), LEAST), "iteration_callback": clock.callback(program)}
@@ -213,20 +230,23 @@ def solve_from_guess(case: AscentCase, mesh: Mesh, guess: dict, clock: SolveCloc
     times = np.append(mesh.t[1:], mesh.t_u if points else [])  # of x and z
     states = interpolate(times, guess["t"], guess["y"][:, :6]) / scale
     start = np.concatenate([states.ravel(), interpolate(mesh.t_u, guess["t_u"], guess["u"]).ravel(), mesh.t[-1:]])
-    box = np.full(len(start) - 1, 2.0)  # far from any ascent; it keeps IPOPT's first steps near the Earth
+    box = np.full(len(start) - 1, 2.0)  # no ascent comes near it, but it keeps IPOPT's first steps near the Earth
     equal = np.zeros(program["g"].numel() - n)
     low, high = (np.append(equal, np.full(n, 1 + h / rocket.Re)) for h in (case.floor, case.ceiling))
-    lbx, ubx = np.append(-box, mesh.final_time[0]), np.append(box, mesh.final_time[1])
+    lbx = np.append(-box, mesh.final_time[0])
+    ubx = np.append(box, mesh.final_time[1])
     solution = solve(x0=start, lbx=lbx, ubx=ubx, lbg=low, ubg=high)
     status = solve.stats()["return_status"]
     if status == "Maximum_WallTime_Exceeded":
         raise NoOptimum(f"rocket ascent {case.key}: not solved within {clock.seconds():.0f} s (--solve-seconds)")
     if status != "Solve_Succeeded":
         raise NoOptimum(f"rocket ascent {case.key}: IPOPT stopped with {status} after {clock.seconds():.0f} s")
-    w, end = solution["x"].full()[:-1, 0], float(solution["x"][-1])
+    w = solution["x"].full()[:-1, 0]
+    end = float(solution["x"][-1])
     y = np.vstack([rocket.x0[:6], w[: 6 * n].reshape(n, 6) * scale])
     shift = end - mesh.t[-1]
-    t, t_u = mesh.t + shift * mesh.stretch, mesh.t_u + shift * np.interp(mesh.t_u, mesh.t, mesh.stretch)
+    t = mesh.t + shift * mesh.stretch
+    t_u = mesh.t_u + shift * np.interp(mesh.t_u, mesh.t, mesh.stretch)
     _, flow, since, mass = burning(rocket, mesh.t[-2])
     found = {"t": t, "y": y, "t_u": t_u, "u": w[6 * n * (1 + points) :].reshape(-1, 3), "status": status}
     costate = solution["lam_g"].full()[: 6 * n * points].reshape(-1, 6)[:, 3:]
@@ -238,25 +258,26 @@ def solve_from_guess(case: AscentCase, mesh: Mesh, guess: dict, clock: SolveCloc
 # ---------------------------------------------------------------------------------------------------------------------
 
 FIXED, CUTOFF = "RocketAscent-v0", "RocketAscentCutoff-v0"
-STORED = {CUTOFF: "free", FIXED: "fixed_capped"}  # the keys of the paper's references; any other's is its id
+STORED = {CUTOFF: "free", FIXED: "fixed_capped"}  # the keys of the paper's references; another id is its own key
 RESULTS = Path(__file__).parents[1] / "results"
-MISS_TOLERANCE = 2e-5  # terminal error of a stored reference in flight, unless it flew worse when it was solved
-HOLD_TOLERANCE = 2e-4  # of a spline's flight where the steps themselves cannot be solved
-IN_PLANE = 1e-3  # rad, below which an optimum's yaw is the solver's rounding
+MISS_TOLERANCE = 2e-5  # largest terminal error of a stored reference in flight, unless it flew worse when solved
+HOLD_TOLERANCE = 2e-4  # largest terminal error of a spline's flight, if the steps themselves cannot be solved
+IN_PLANE = 1e-3  # rad; a smaller yaw of an optimum is the solver's rounding
 
 
 def mission_case(key: str, mission: Mission) -> AscentCase:
-    """What a mission's policy is measured against: with cut-off the heaviest, else the least turning below its ceiling.
+    """The case that a mission's policy is measured against.
 
-    With free time no ceiling is imposed: what is left of the mass is then a bound for every flight.
+    With cut-off it is the ascent with the most mass, without a ceiling, so that its mass is a bound for every flight.
+    Without cut-off it is the ascent that turns least below the mission's ceiling.
     """
     return AscentCase(key, mission.rocket, mission.cutoff, np.inf if mission.cutoff else mission.ceiling)
 
 
 def ascent_guesses(rocket: Rocket) -> list[tuple[float, float]]:
-    """Final times and times in which to tilt from straight up to the horizon, s each, in the order they are tried.
+    """Guesses of the final time (s) and of the time (s) to tilt from straight up to the horizon, in the order to try.
 
-    Each final time is well within the last burn: an optimum is looked for in the arc that its guess ends in.
+    An optimum is looked for in the arc that its guess ends in. So each final time is well within the last burn.
     """
     last = rocket.end_time
     earliest = min((rocket.last_ignition + last) / 2, last)
@@ -267,7 +288,7 @@ def ascent_guesses(rocket: Rocket) -> list[tuple[float, float]]:
 def pitch_times(rocket: Rocket, end: float):
     """The times (s) of `nine_pitch_angles`: the start, 30 s, every staging, quarters of the longest burn, the `end`.
 
-    Nine for four burns; with fewer, the longest intervals are halved until there are nine.
+    With four burns they are nine. With fewer burns the longest intervals are halved until there are nine.
     """
     ends = [*(burn.end for burn in rocket.burns[:-1]), end]
     begins = [0.0, *ends[:-1]]
@@ -281,12 +302,12 @@ def pitch_times(rocket: Rocket, end: float):
 
 
 def fly_directions(env_id: str, rocket: Rocket, u, end: float) -> dict:
-    """`fly_rocket` of the directions u (K, 3) in ECI, held over the steps until `end` (s)."""
+    """`fly_rocket` with the directions u (K, 3) in ECI, held over the steps until `end` (s)."""
     return fly_rocket(env_id, lambda obs, k: u[k, None], end_time=end, rocket=rocket)
 
 
 def fly_angles(env_id: str, pitch, yaw, end: float, **options) -> dict:
-    """`fly_rocket` at the angles `pitch` above the horizon and `yaw` out of the target's plane, (K,) rad each."""
+    """`fly_rocket` at the angles `pitch` above the horizon and `yaw` out of the target's plane, (K,) in rad each."""
     ahead = np.cos(yaw)
     u = np.stack([np.sin(pitch) * ahead, np.cos(pitch) * ahead, np.sin(yaw)], axis=1)
     return fly_rocket(env_id, lambda obs, k: u[k, None], end_time=end, action_frame="local", **options)
@@ -301,7 +322,7 @@ def cold_start(case: AscentCase, end: float, tilt_time: float) -> dict:
 
 
 def refuse_too_weak(case: AscentCase):
-    """RuntimeError where all the delta-v at once, on the ground and eastwards, has not the target's energy."""
+    """Raise NoOptimum if all the delta-v at once, on the ground and eastwards, does not give the target's energy."""
     rocket = case.rocket
     speed = delta_v(rocket) + np.linalg.norm(rocket.x0[3:6])
     if speed**2 / 2 - rocket.mu / rocket.Re < rocket.target_energy:
@@ -311,17 +332,20 @@ def refuse_too_weak(case: AscentCase):
 
 
 def optimise_ascent(case: AscentCase, segments: int = SEGMENTS) -> dict:
-    """The optimum from the first of `ascent_guesses` that IPOPT takes there: what `solve_from_guess` returns.
+    """The optimum that IPOPT finds from the first of `ascent_guesses` that leads to one, as `solve_from_guess` has it.
 
-    With free final time by direct collocation, else by the environment's own steps. Raises RuntimeError that says what
-    to look at where there is none.
+    With free final time it is solved by direct collocation, otherwise in the environment's own steps. Raises NoOptimum
+    if there is none, with a line that says what to look at.
     """
     rocket = case.rocket
     refuse_too_weak(case)
     clock = SolveClock(f"rocket ascent {case.key}")
     for end, tilt_time in ascent_guesses(rocket):
-        end = end if case.free else rocket.end_time
-        mesh = collocation_mesh(case, end, segments) if case.free else zero_order_hold_mesh(rocket, end)
+        if case.free:
+            mesh = collocation_mesh(case, end, segments)
+        else:
+            end = rocket.end_time
+            mesh = zero_order_hold_mesh(rocket, end)
         try:
             found = solve_from_guess(case, mesh, cold_start(case, end, tilt_time), clock)
         except NoOptimum as error:
@@ -335,7 +359,7 @@ def optimise_ascent(case: AscentCase, segments: int = SEGMENTS) -> dict:
 
 
 def refuse_early_orbit(case: AscentCase, end: float):
-    """NoOptimum where the optimum uses nothing of the last burn: in it the engine is to be cut off."""
+    """Raise NoOptimum if the optimum uses nothing of the last burn, in which the engine is to be cut off."""
     begins = case.rocket.last_ignition
     if case.free and len(case.rocket.burns) > 1 and end < begins + 1e-3:
         todo = "leave that burn out, or give it more payload or a higher orbit"
@@ -345,7 +369,7 @@ def refuse_early_orbit(case: AscentCase, end: float):
 
 
 def suspects(case: AscentCase) -> str:
-    """What is usually wrong where no optimum is found, with its values."""
+    """The fields that are usually wrong if no optimum is found, with their values, in words."""
     rocket = case.rocket
     north = launch_raan(rocket.latitude, rocket.i)
     planes = f"{north:.4f} towards the north and {(180 - north) % 360:.4f} towards the south"
@@ -357,10 +381,9 @@ def suspects(case: AscentCase) -> str:
 
 
 def reached_optimum(flight: dict, rocket: Rocket = ROCKET) -> dict:
-    """The optimum with free final time, as `optimise_ascent`, for the orbit that a flight reached, not the target.
+    """The optimum with free final time for the orbit that a flight reached, as `optimise_ascent` returns it.
 
-    Of `flight` its five elements are read: `a_km e i_deg raan_deg argp_deg`. Raises RuntimeError where IPOPT finds no
-    optimum.
+    `flight` gives the five elements `a_km e i_deg raan_deg argp_deg`. Raises NoOptimum if IPOPT finds no optimum.
     """
     angles = {name: float(flight[f"{name}_deg"]) for name in ("i", "raan", "argp")}
     with warnings.catch_warnings():  # an inclination that misses the launch latitude by a hair is no dog-leg
@@ -375,28 +398,40 @@ def reached_optimum(flight: dict, rocket: Rocket = ROCKET) -> dict:
 def nine_pitch_angles(env_id: str, flight: dict, rocket: Rocket) -> dict:
     """The opponent: a cubic spline through a flight's pitch at nine times (`pitch_times`), flown without feedback.
 
-    Where the flight steers out of the target's plane by more than `IN_PLANE`, its yaw at these times, too. Returns what
-    `fly_rocket` does. The times are ours: close together where the pitch turns fast.
+    If the flight steers out of the target's plane by more than `IN_PLANE`, a spline through its yaw is flown, too. The
+    times are our choice. They are close together where the pitch turns fast. Returns what `fly_rocket` does.
     """
     from scipy.interpolate import CubicSpline
 
     t, u = flight["t"], flight["u"].T
     frame = local_frame(flight["y"][:-1].T, target_axes(rocket)[2])
     up, along, cross = ((u * axis).sum(axis=0) for axis in frame)
-    pitch, yaw, middle = np.arctan2(up, along), np.arcsin(np.clip(cross, -1, 1)), (t[:-1] + t[1:]) / 2
-    knots, burns = pitch_times(rocket, t[-1]), burning(rocket, middle)[0] > 0  # in a coast a direction means nothing
-    pitch, yaw = (CubicSpline(knots, np.interp(knots, middle[burns], angle[burns]))(middle) for angle in (pitch, yaw))
+    pitch = np.arctan2(up, along)
+    yaw = np.arcsin(np.clip(cross, -1, 1))
+    middle = (t[:-1] + t[1:]) / 2
+    knots = pitch_times(rocket, t[-1])
+    thrust, *_ = burning(rocket, middle)
+    burns = thrust > 0  # in a coast a direction means nothing
+
+    def smooth(angle):
+        at_knots = np.interp(knots, middle[burns], angle[burns])
+        return CubicSpline(knots, at_knots)(middle)
+
+    pitch = smooth(pitch)
+    yaw = smooth(yaw)
     if np.abs(np.arcsin(np.clip(cross, -1, 1))).max() <= IN_PLANE:
         yaw = np.zeros_like(pitch)
     return fly_angles(env_id, pitch, yaw, t[-1], rocket=rocket)
 
 
 def hold_steps(case: AscentCase, collocated: dict) -> dict:
-    """The optimum of the environment's own steps with free final time, from a collocation; as `solve_from_guess`.
+    """The optimum of the environment's own steps with free final time, from the guess `collocated`.
 
-    It takes a little longer than the collocation's, and so may end in the step after.
+    Its flight takes a little longer than the collocation's, so it may end in the next step. Returns what
+    `solve_from_guess` does.
     """
-    rocket, end = case.rocket, collocated["final_time"]
+    rocket = case.rocket
+    end = collocated["final_time"]
     clock = SolveClock(f"rocket ascent {case.key}, held steps")
     next_step = rocket.dt * (np.floor(end / rocket.dt + 1e-9) + 1)
     for guessed_end in (end, min(next_step + rocket.dt / 2, rocket.end_time)):
@@ -412,15 +447,16 @@ def hold_steps(case: AscentCase, collocated: dict) -> dict:
 
 @cache
 def solve_and_fly(case: AscentCase):
-    """One ascent: its numbers, its flight by the environment, and the collocation (None if the time is fixed).
+    """One ascent: its numbers, its flight by the environment, and the collocation (None if the final time is fixed).
 
-    With free final time the collocation's directions at mid-step are held over the environment's steps. Where that
-    flight misses by more than `MISS_TOLERANCE` (across a jump of the direction a spline means nothing), the steps are
-    solved themselves, as with fixed time. Raises NoOptimum where the flight misses by more than `HOLD_TOLERANCE`.
+    With free final time the collocation's directions at mid-step are held over the environment's steps. A spline means
+    nothing across a jump of the direction. So if that flight misses by more than `MISS_TOLERANCE`, the steps themselves
+    are solved, as with fixed time. Raises NoOptimum if the flight misses by more than `HOLD_TOLERANCE`.
     """
     from scipy.interpolate import CubicSpline
 
-    begin, rocket = time.perf_counter(), case.rocket
+    begin = time.perf_counter()
+    rocket = case.rocket
     solution = optimise_ascent(case)
     optimum = solution if case.free else None
     if case.free:
@@ -449,7 +485,7 @@ def solve_and_fly(case: AscentCase):
 
 
 def reference_case(env_id: str, mission: Mission) -> AscentCase:
-    """What `rocket_reference` solves; its key is the one under which results/ may hold it."""
+    """The case that `rocket_reference` solves. results/ may hold its solution under its key."""
     key = STORED.get(env_id, env_id)
     case = mission_case(key, mission)
     has_other_rules = key in ASCENTS and case != ASCENTS[key]  # neither the paper's rocket nor its ceiling
@@ -457,12 +493,12 @@ def reference_case(env_id: str, mission: Mission) -> AscentCase:
 
 
 def rocket_reference(env_id: str, **options) -> dict:
-    """The reference of an environment id, flown by it: what `fly_rocket` returns, and three numbers beside it.
+    """The reference of an environment id, flown by its environment: what `fly_rocket` returns, and three numbers.
 
-    `reference_mass_kg` and `reference_time_s` of the solve (see `mission_case`), `nine_pitch_error_norm` of
-    `nine_pitch_angles`. `options` of the environment, `rocket` and `table_isp`, change what is solved. Read from
-    results/rocket_reference.{json,npz} where it is there and still reaches the target, else solved, with CasADi.
-    Raises ValueError on an unknown id, NoOptimum where a solve fails.
+    The numbers are `reference_mass_kg` and `reference_time_s` of the solve (`mission_case`), and
+    `nine_pitch_error_norm` of `nine_pitch_angles`. The environment's options `rocket` and `table_isp` change what is
+    solved. A solution in results/rocket_reference.{json,npz} that still reaches the target is read; otherwise CasADi
+    solves. Raises ValueError for an unknown id, and NoOptimum if a solve fails.
     """
     if env_id not in ROCKETS:
         raise ValueError(f"env_id is {env_id!r}; it must be one of {', '.join(ROCKETS)}")
@@ -470,7 +506,7 @@ def rocket_reference(env_id: str, **options) -> dict:
 
 
 def mission_reference(env_id: str, mission: Mission) -> dict:
-    """`rocket_reference` of a mission, which need not be the one that the id is registered for."""
+    """`rocket_reference` of a mission. The id may be registered for another mission."""
     case = reference_case(env_id, mission)
     found = stored_reference(env_id, case) if mission == ROCKETS[env_id] else None
     if found is None:
@@ -488,7 +524,7 @@ kept_reference = lru_cache(maxsize=4)(mission_reference)  # evaluations during a
 
 
 def stored_reference(env_id: str, case: AscentCase) -> tuple[dict, dict] | None:
-    """The numbers of a solve in results/ and its flight by the environment; None where none fits the case any more."""
+    """The numbers of a solve in results/, and its flight by the environment. None if no solve there fits the case."""
     rocket = case.rocket
     try:
         numbers, u, end = stored_ascent(case.key)
@@ -503,7 +539,7 @@ def stored_reference(env_id: str, case: AscentCase) -> tuple[dict, dict] | None:
 
 
 def stored_ascent(key: str):
-    """The numbers, directions (K, 3) and final time (s) of a solve in results/; many errors where it cannot be read."""
+    """The numbers, directions (K, 3) and final time (s) of a solve in results/. A bad file raises many errors."""
     numbers = json.loads((RESULTS / "rocket_reference.json").read_text())[key]
     numbers = {name: float(numbers[name]) for name in ("final_mass_kg", "final_time_s", "replay_error_norm")}
     with np.load(RESULTS / "rocket_reference.npz") as arrays:

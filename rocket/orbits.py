@@ -1,6 +1,6 @@
-"""Orbits: which one a state is on, how far it is from the target's, and the frame in which a pilot steers.
+"""Orbits: the orbit that a state is on, its distance from the target orbit, and the frame in which a pilot steers.
 
-A state's functions take components, NumPy arrays or CasADi symbols, where their docstrings say so.
+Where a docstring says "by components", a state's components may be NumPy arrays or CasADi symbols.
 """
 
 from __future__ import annotations
@@ -11,11 +11,15 @@ from rocket.vehicle import ROCKET, OrbitalElements, Rocket
 
 
 def orbit_vectors(x, mu: float = ROCKET.mu):
-    """Angular momentum h = r x v and eccentricity vector e = v x h / mu - r / |r|, each a tuple of components."""
+    """Angular momentum h = r x v (m^2/s) and eccentricity vector e = v x h / mu - r / |r| of a state by components."""
     rx, ry, rz, vx, vy, vz = x[:6]
-    hx, hy, hz = ry * vz - rz * vy, rz * vx - rx * vz, rx * vy - ry * vx
+    hx = ry * vz - rz * vy
+    hy = rz * vx - rx * vz
+    hz = rx * vy - ry * vx
     r = (rx * rx + ry * ry + rz * rz) ** 0.5
-    ex, ey, ez = (vy * hz - vz * hy) / mu - rx / r, (vz * hx - vx * hz) / mu - ry / r, (vx * hy - vy * hx) / mu - rz / r
+    ex = (vy * hz - vz * hy) / mu - rx / r
+    ey = (vz * hx - vx * hz) / mu - ry / r
+    ez = (vx * hy - vy * hx) / mu - rz / r
     return (hx, hy, hz), (ex, ey, ez)
 
 
@@ -26,29 +30,31 @@ def specific_energy(x, mu: float = ROCKET.mu):
 
 
 def orbital_elements(state, mu: float = ROCKET.mu) -> OrbitalElements:
-    """Keplerian elements of states (..., 6 or more: r in m, v in m/s), each (...,); e.g. Vallado, algorithm 9 (RV2COE).
+    """Keplerian elements (...,) each of states (..., 6 or more: r in m, v in m/s). |r| must be positive.
 
-    Where an angle has no meaning it is 0: the node of an equatorial orbit (the perigee is then counted from the x axis,
-    in the direction of flight), the perigee of a circular one. |r| must be positive.
+    An angle without meaning is 0: the node of an equatorial orbit, and the perigee of a circular one. The perigee of an
+    equatorial orbit is counted from the x axis in the direction of flight. Source: e.g. Vallado, algorithm 9 (RV2COE).
     """
     x = np.moveaxis(np.asarray(state, dtype=np.float64), -1, 0)
     h, e = (np.array(vector) for vector in orbit_vectors(x, mu))
     energy = specific_energy(x, mu)
     a = np.divide(-mu, 2 * energy, out=np.full(energy.shape, np.inf), where=energy != 0)
-    equatorial, eccentricity = (h[0] == 0) & (h[1] == 0), np.sqrt((e * e).sum(axis=0))
+    equatorial = (h[0] == 0) & (h[1] == 0)
+    eccentricity = np.sqrt((e * e).sum(axis=0))
     node = np.where(equatorial, 1.0, -h[1]), np.where(equatorial, 0.0, h[0])  # z x h, of any length
     i = np.arctan2(np.hypot(h[0], h[1]), h[2])
     along = node[0] * e[0] + node[1] * e[1]
-    # e . (h x node), in units of |h|: the component of e a right angle ahead of the node
+    # e . (h x node) in units of |h|, the component of e at a right angle ahead of the node
     ahead = e[0] * -h[2] * node[1] + e[1] * h[2] * node[0] + e[2] * (h[0] * node[1] - h[1] * node[0])
     argp = np.arctan2(ahead, along * np.sqrt((h * h).sum(axis=0)))
     circular = eccentricity < 1e-14
-    raan, argp = np.arctan2(node[1], node[0]) % (2 * np.pi), np.where(circular, 0.0, argp % (2 * np.pi))
+    raan = np.arctan2(node[1], node[0]) % (2 * np.pi)
+    argp = np.where(circular, 0.0, argp % (2 * np.pi))
     return OrbitalElements(a, eccentricity, i, raan, argp)
 
 
 def target_orbit(elements: OrbitalElements = ROCKET.target, mu: float = ROCKET.mu):
-    """Angular momentum (..., 3), m^2/s, and eccentricity vector (..., 3) of orbits given by their elements (m, rad)."""
+    """Angular momentum (..., 3) in m^2/s and eccentricity vector (..., 3) of orbits with these elements (m, rad)."""
     a, e, i, raan, argp = (np.asarray(element, dtype=np.float64) for element in elements)
     normal = np.stack([np.sin(raan) * np.sin(i), -np.cos(raan) * np.sin(i), np.cos(i)], axis=-1)
     perigee = [
@@ -60,34 +66,37 @@ def target_orbit(elements: OrbitalElements = ROCKET.target, mu: float = ROCKET.m
 
 
 def target_axes(rocket: Rocket = ROCKET) -> np.ndarray:
-    """Rows: perigee direction, semi-latus direction, plane normal of the target orbit, (3, 3), unit vectors in ECI.
+    """The target orbit's axes (3, 3), unit vectors in ECI: to the perigee, along the semi-latus rectum, plane normal.
 
-    A circle has no perigee: its axes are those of an ellipse with the same angles.
+    A circle has no perigee. Its axes are those of an ellipse with the same angles.
     """
     h, e = target_orbit(rocket.target._replace(e=rocket.e or 0.5), rocket.mu)
-    normal, perigee = h / np.linalg.norm(h), e / np.linalg.norm(e)
+    normal = h / np.linalg.norm(h)
+    perigee = e / np.linalg.norm(e)
     return np.array([perigee, np.cross(normal, perigee), normal])
 
 
 def terminal_error(state, rocket: Rocket = ROCKET) -> np.ndarray:
     """(h - h_T) / |h_T| and e - e_T in ECI, (..., 6), of states (..., 6 or more: r in m, v in m/s).
 
-    Our measure. Smooth, without a singularity, and zero exactly where all five elements are the target's.
+    This is our measure. It is smooth and has no singularity. It is zero if and only if all five elements are the
+    target's.
     """
     h, e = orbit_vectors(np.moveaxis(np.asarray(state, dtype=np.float64), -1, 0), rocket.mu)
     h_target, e_target = target_orbit(rocket.target, rocket.mu)
-    return np.concatenate(
-        [(np.stack(h, axis=-1) - h_target) / np.linalg.norm(h_target), np.stack(e, axis=-1) - e_target], axis=-1
-    )
+    of_momentum = (np.stack(h, axis=-1) - h_target) / np.linalg.norm(h_target)
+    of_eccentricity = np.stack(e, axis=-1) - e_target
+    return np.concatenate([of_momentum, of_eccentricity], axis=-1)
 
 
 def local_frame(y, normal):
     """Unit vectors up, along-track (normal x up), cross-track (up x along) at states y (7, N): (3, N) each.
 
-    Written out: a matrix product would round a row differently in a larger batch.
+    The products are written out, because a matrix product would round a row differently in a larger batch.
     """
     up = y[:3] / np.sqrt((y[:3] ** 2).sum(axis=0))
-    (rx, ry, rz), (nx, ny, nz) = up, normal
+    rx, ry, rz = up
+    nx, ny, nz = normal
     along = np.array([ny * rz - nz * ry, nz * rx - nx * rz, nx * ry - ny * rx])
     length = np.sqrt((along * along).sum(axis=0))
     cross = normal[:, None] - (nx * rx + ny * ry + nz * rz) * up

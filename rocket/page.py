@@ -1,6 +1,6 @@
-"""What a rocket's page needs of Python: constants of vehicle, Earth and target, the policy, the optimum and its gains.
+"""The data of a rocket's page: constants of vehicle, Earth and target, the policy, the optimum and its gains.
 
-pages/rocket_physics.js and pages/rocket_laws.js read them by these names; SI units.
+pages/rocket_physics.js and pages/rocket_laws.js read them by these names, in SI units.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from rocket.orbits import target_axes, target_orbit
 from rocket.policy_constants import DIFFERENCES
 from rocket.vehicle import EngineGroup, Rocket, engine_groups
 
-OPTIONS = {"observe_phase": True, "observe_draw": False, "observe_mass": False}  # that a policy was trained with
+OPTIONS = {"observe_phase": True, "observe_draw": False, "observe_mass": False}  # a policy is trained with these
 SLIDER_SIGMAS = 6  # how far a slider goes, in standard deviations of a draw
-SEEN = 8 + 3 + 2 + 12  # features but for the phase's, the draw's and the differences: `features` of the script
+SEEN = 8 + 3 + 2 + 12  # number of `features` of the script, without those of the phase, the draw and the differences
 
 
 def page(env_id: str, mission: Mission, metrics: dict, arrays: dict, checkpoint: dict, launch_longitude: float) -> Page:
-    """The page of a policy: the nominal flight beside the optimum, and all that flies anew in the browser.
+    """The page of a policy: the nominal flight beside the optimum, and what the browser needs to fly both anew.
 
-    BadInput where no vehicle can be drawn of the table, or the policy has other features.
+    Raises BadInput if no vehicle can be drawn of the table, or if the policy has other features.
     """
     rocket = mission.rocket
     allowed = "must be False for a page: its stages keep what a vehicle of the page would drop"
@@ -58,7 +58,7 @@ def page(env_id: str, mission: Mission, metrics: dict, arrays: dict, checkpoint:
 
 
 def constants(mission: Mission, dispersion: float) -> dict:
-    """Everything that the physics reads."""
+    """The constants that the page's physics reads."""
     rocket = mission.rocket
     h_target, e_target = target_orbit(rocket.target, rocket.mu)
     return {
@@ -88,7 +88,7 @@ def constants(mission: Mission, dispersion: float) -> dict:
 
 
 def group_constants(rocket: Rocket, group: EngineGroup) -> dict:
-    """Engines that are dropped together, numbers of one of them."""
+    """The constants of engines that are dropped together. All but `number` are those of one engine."""
     engine = group.engine
     engines = "engine" if group.number == 1 else "engines"
     return {
@@ -106,7 +106,7 @@ def group_constants(rocket: Rocket, group: EngineGroup) -> dict:
 
 
 def slider(score: str) -> str:
-    """The slider of the page that moves a score of a draw; "" where none does."""
+    """The page's slider that moves a score of a draw, or "" if none does."""
     of_all_engines = "thrust" if score.startswith("burn_rate") else ""
     named = {"payload": "payload", "drag": "drag", "wind_east": "windEast", "wind_north": "windNorth"}
     return named.get(score, of_all_engines)
@@ -139,7 +139,7 @@ def sliders(rocket: Rocket) -> list[dict]:
 
 
 def seen_mass(rocket: Rocket) -> list[float]:
-    """The flight computer's mass at the beginning of each burn, kg: the nominal vehicle's."""
+    """The flight computer's mass in kg at the beginning of each burn, which is the nominal vehicle's."""
     nominal = draw_vehicles(rocket, 1.0, np.zeros((1, len(draw_names(rocket)))))
     last = len(rocket.burns) - 1
     ends, flow, dropped = (getattr(nominal, name)[:last, 0] for name in ("end", "flow", "dropped"))

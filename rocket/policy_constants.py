@@ -1,4 +1,4 @@
-"""What a policy is given of a rocket beside its observations: constants that are saved with its weights."""
+"""What a policy is told of a rocket beside its observations: constants that are saved with its weights."""
 
 from __future__ import annotations
 
@@ -7,21 +7,23 @@ import numpy as np
 from rocket.orbits import target_axes, target_orbit
 from rocket.vehicle import Rocket
 
-# sizes by which flights at dispersion 1 differ at the same energy of the same burn: the three components of
-# (h - h_T) / |h_T| and those of e - e_T, the logarithm of the observed mass, the angle flown in rad
+# Flights at dispersion 1 differ by about these sizes at the same energy of the same burn. The numbers are the three
+# components of (h - h_T) / |h_T|, the three of e - e_T, the logarithm of the observed mass, and the angle flown in rad.
 DIFFERENCES = [5e-5, 5e-5, 5e-5, 1e-4, 3e-4, 2e-5, 0.01, 0.004]
-# for flights that lose thrust: a quarter less of the last stage's moves the orbit by up to a hundred of those
+# Flights that lose thrust differ more: a quarter less thrust of the last stage moves the orbit by up to 100 such sizes.
 WIDE_DIFFERENCES = [10 * size for size in DIFFERENCES[:6]] + DIFFERENCES[6:]
 
 
 def policy_constants(rocket: Rocket) -> dict:
-    """What a policy is given of a rocket, as lists, saved with its weights: the target orbit in its own axes, mu = 1.
+    """The constants of a policy for a rocket, as lists, in units in which mu = 1 and in the target orbit's axes.
 
-    `axes` (3, 3), rows towards the perigee, along the semi-latus rectum and normal to the plane; `units` (7,) of r, v
-    and m (the Earth's radius, circular speed there, the dry mass); angular momentum `h_target` and eccentricity vector
-    `e_target` (3,); `phases`, what is observed of each burn; `nominal_flight` (steps + 1, 10), rows of burn, specific
-    energy and what flights are compared by, which a dispersed training fills; `differences` (8,), the sizes of those,
-    which a training with failures makes wide.
+    - `axes` (3, 3): rows to the perigee, along the semi-latus rectum and normal to the plane
+    - `units` (7,) of r, v and m: the Earth's radius (m), the circular speed there (m/s) and the dry mass (kg)
+    - `h_target` and `e_target` (3,) each: angular momentum and eccentricity vector
+    - `phases`: the observed phase of each burn
+    - `nominal_flight` (steps + 1, 10): rows of burn, specific energy and the 8 numbers by which flights are compared; a
+      dispersed training fills it
+    - `differences` (8,): the sizes of those numbers' differences; a training with failures makes them wide
     """
     axes = target_axes(rocket)
     steps = int(np.ceil(rocket.end_time / rocket.dt))

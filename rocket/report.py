@@ -1,6 +1,6 @@
-"""`python baselines.py rocket`, and of one rocket by its id: solve, print rows, checks and the open-loop opponent.
+"""`python baselines.py rocket`, or the same with a rocket's id: solve, print rows, checks and the open-loop opponent.
 
-With --failure: what flights with failures can still reach.
+With --failure it solves and prints what flights with failures can still reach.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ COLUMNS = ("final_mass_kg", "final_time_s", "error_norm", "replay_error_norm", "
 
 
 def report_all_rockets() -> tuple[dict, dict]:
-    """Solve `ASCENTS` and the other missions', print them and their checks; the numbers and arrays for the files."""
+    """Solve `ASCENTS` and the other missions, print them and their checks. Returns numbers and arrays for the files."""
     others = {key: mission_case(key, mission) for key, mission in ROCKETS.items() if key not in STORED}
     numbers, flights, optima = solve_and_print(ASCENTS | others)
     numbers["checks"] = optimum_checks(numbers, optima["free"])
@@ -40,13 +40,13 @@ def report_all_rockets() -> tuple[dict, dict]:
 
 
 def report_rocket(env_id: str) -> tuple[dict, dict]:
-    """Solve one mission and print it; the numbers and arrays for the files."""
+    """Solve one mission and print it. Returns the numbers and arrays for the files."""
     numbers, flights, _ = solve_and_print({env_id: mission_case(env_id, ROCKETS[env_id])})
     return numbers | open_loop_numbers(flights), solution_arrays(flights)
 
 
 def solve_and_print(cases: dict) -> tuple[dict, dict, dict]:
-    """Solve each case and print its row: its numbers, flight and collocation, by its key."""
+    """Solve each case and print its row. Returns numbers, flights and collocations, by the case's key."""
     print(f"{'':<16}" + "".join(f"{name:>19}" for name in COLUMNS) + "  status")
     numbers, flights, optima = {}, {}, {}
     for key, case in cases.items():
@@ -62,14 +62,18 @@ def solution_arrays(flights: dict) -> dict:
 
 
 def pontryagin_angle(optimum: dict):
-    """Angles (m,), degrees, between the thrust and the costate of the velocity, which the maximum principle wants 0."""
-    u, costate = optimum["u"], optimum["costate"]
-    return np.degrees(np.arctan2(np.linalg.norm(np.cross(u, costate), axis=1), (u * costate).sum(axis=1)))
+    """Angles (m,) in degrees between the thrust and the velocity's costate. By the maximum principle they are 0."""
+    u = optimum["u"]
+    costate = optimum["costate"]
+    across = np.linalg.norm(np.cross(u, costate), axis=1)
+    along = (u * costate).sum(axis=1)
+    return np.degrees(np.arctan2(across, along))
 
 
 def optimum_checks(numbers: dict, optimum: dict) -> dict:
-    """Checks of `free`, by its collocation `optimum`: the maximum principle, the mass that drag costs, other meshes."""
-    mass, angle = numbers["free"]["final_mass_kg"], pontryagin_angle(optimum)
+    """Checks of the case `free`: the maximum principle on its collocation, the mass that drag costs, other meshes."""
+    mass = numbers["free"]["final_mass_kg"]
+    angle = pontryagin_angle(optimum)
     checks = {"costate_angle_deg_max": angle.max(), "costate_angle_deg_median": np.median(angle)}
     checks["drag_free_mass_gain_kg"] = numbers["drag_free"]["final_mass_kg"] - mass
     for segments in (SEGMENTS // 2, 2 * SEGMENTS):
@@ -78,10 +82,12 @@ def optimum_checks(numbers: dict, optimum: dict) -> dict:
 
 
 def open_loop_numbers(flights: dict) -> dict:
-    """`nine_pitch_angles` of every mission whose optimum is among the flights, printed; its numbers by a name each."""
-    names, numbers = {CUTOFF: "nine_pitch_angles", FIXED: "nine_pitch_angles_fixed"}, {}
+    """Print `nine_pitch_angles` of every mission whose optimum is among the flights. Returns {name: its numbers}."""
+    names = {CUTOFF: "nine_pitch_angles", FIXED: "nine_pitch_angles_fixed"}
+    numbers = {}
     for env_id, mission in ROCKETS.items():
-        key, name = STORED.get(env_id, env_id), names.get(env_id, f"nine_pitch_angles_{env_id}")
+        key = STORED.get(env_id, env_id)
+        name = names.get(env_id, f"nine_pitch_angles_{env_id}")
         flight = flights.get(env_id, flights.get(key))
         if flight is not None:
             opponent = nine_pitch_angles(env_id, flight, mission.rocket)
@@ -91,9 +97,9 @@ def open_loop_numbers(flights: dict) -> dict:
 
 
 def report_failures(env_id: str, failing: Failing, starts: int, seed: int) -> tuple[dict, dict]:
-    """Solve what the flights with a failure among the draws of a seed can still reach, and print it by their engines.
+    """Solve what the flights with a failure among the draws of a seed can still reach. Print it by group of engines.
 
-    The numbers; and the arrays of `Known` and `about`, which evaluations read where the file lies in results/.
+    Returns the numbers, and the arrays of `Known` and `about`. Evaluations read the arrays from a file in results/.
     """
     mission = ROCKETS[env_id]
     z = draws(mission.rocket, failing.dispersion, seed, starts, failing.failure)

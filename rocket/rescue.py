@@ -1,9 +1,10 @@
-"""The optimum that knows of a failure from the moment it strikes: whether a flight can be saved, and with what mass.
+"""The optimum that knows of a failure from the moment it strikes. It shows whether a flight can be saved.
 
-Until the strike it is the optimum of the drawn vehicle, which expects no failure. From there on the remaining ascent is
-solved again, with the engines as they are left. Its last burn may go on below the dry mass: so there is an optimum
-nearly always, and a flight is savable where that ends above the dry mass.
-Reading order: one flight, many flights, those that are stored. CasADi and SciPy are imported only where they are used.
+Until the strike it is the optimum of the drawn vehicle, which expects no failure. Then the remaining ascent is solved
+again, with the thrust that is left. Its last burn may go on below the dry mass, so there is nearly always an optimum.
+A flight is savable if this optimum ends above the dry mass.
+
+Reading order: one flight, many flights, stored optima. CasADi and SciPy are imported only where they are used.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from rocket.vehicle import Rocket
 
 
 class Failing(NamedTuple):
-    """The options of the environment that say which failures are drawn, and in which vehicles."""
+    """The environment's options that say which failures and which vehicles are drawn."""
 
     dispersion: float = 0.0
     failure: float = 0.0
@@ -36,7 +37,7 @@ class Failing(NamedTuple):
 
     @classmethod
     def of(cls, env_options: dict) -> Failing:
-        """Those among the options of an environment."""
+        """The fields among the options of an environment."""
         return cls(**{name: env_options[name] for name in cls._fields if name in env_options})
 
 
@@ -44,21 +45,21 @@ class Failing(NamedTuple):
 # One flight
 # ---------------------------------------------------------------------------------------------------------------------
 
-RELAXED_MASS = 0.5  # part of the dry mass at which the last burn ends at the latest
-MESHES = (1, 2, 0.5)  # times a healthy flight's intervals, tried in turn: on few early strikes IPOPT gives up
+RELAXED_MASS = 0.5  # the last burn may go on down to this part of the dry mass
+MESHES = (1, 2, 0.5)  # factors on a healthy flight's intervals, tried in turn; IPOPT gives up on a few early strikes
 
 
 def solve_rescue(job):
-    """The optimum of one flight, None where IPOPT finds none: job is (rocket, failing, z, guess), z (k + 4,) its draw.
+    """The optimum of one flight, or None if IPOPT finds none. job is (rocket, failing, z, guess), z (k + 4,) its draw.
 
-    Of a healthy flight that of `guidance.drawn_optima`, of another that of `rescued`.
+    A healthy flight has the optimum of `guidance.drawn_optima`, another flight that of `rescued`.
     """
     rocket, failing, z, guess = job
     orbit = target_orbit(rocket.target, rocket.mu)
     healthy = guidance.solve_drawn((rocket, failing.dispersion, z, orbit, guess))
     vehicle = draw_vehicles(rocket, failing.dispersion, z[None], failing.failure, failing.failure_time)
     burn, moment, _ = vehicle.failure[:, 0]
-    # no failure, or one behind the cut-off or in the environment's last step, after which no direction is chosen
+    # no failure, or one after the cut-off, or one in the environment's last step, after which no direction is chosen
     if healthy is None or burn < 0 or moment > healthy["final_time"] - rocket.dt:
         return healthy
     before = draw_vehicles(rocket, failing.dispersion, z[None])
@@ -73,18 +74,20 @@ def solve_rescue(job):
 
 
 def rescued(rocket: Rocket, vehicle: Vehicles, before: Vehicles, healthy: dict, orbit, intervals) -> dict:
-    """The optimum of one vehicle that flies `healthy` until its failure strikes, and knows of it from there on.
+    """The optimum of a vehicle that flies `healthy` until its failure strikes, and knows of the failure from then on.
 
-    `before` is the vehicle without the failure; `intervals` has a number for each burn. Returns what
-    `optimise_remaining` does of the time after the strike, with `healthy` and the `strike` (s) beside it. Raises
-    NoOptimum where IPOPT finds none.
+    `before` is the vehicle without the failure. `intervals` has a number for each burn. Returns what
+    `optimise_remaining` does for the time after the strike, with `healthy` and the `strike` (s). Raises NoOptimum if
+    IPOPT finds none.
     """
     strike = vehicle.failure[1, 0]
     state = state_at(healthy, strike)
     first = int((before.burn_end[:-1, 0] <= strike).sum())  # the burn in which it strikes
     remaining = remaining_after(vehicle, strike, state, orbit)
-    # the guess is the healthy flight's rest: each burn stretched to its length now, and the last to what is lost of it
-    flow_before, flow_now = before.flow[len(before.burn_end) - 1, 0], remaining.flow[-1]
+    # The guess is the rest of the healthy flight, with each burn stretched to its new length. The ratio of the flows
+    # stretches the last burn.
+    flow_before = before.flow[len(before.burn_end) - 1, 0]
+    flow_now = remaining.flow[-1]
     old = np.array([strike, *before.burn_end[first:-1, 0], healthy["final_time"]])
     new = np.array([strike, *vehicle.burn_end[first:-1, 0], 0.0])
     new[-1] = new[-2] + (old[-1] - old[-2]) * flow_before / flow_now
@@ -92,13 +95,14 @@ def rescued(rocket: Rocket, vehicle: Vehicles, before: Vehicles, healthy: dict, 
     for t, values in (("t", "y"), ("t_u", "u")):
         later = healthy[t] > min(strike, healthy[t][-2])
         guess |= {t: np.interp(healthy[t][later], old, new), values: healthy[values][later]}
-    guess["t"], guess["y"] = np.append(strike, guess["t"]), np.vstack([state, guess["y"]])
+    guess["t"] = np.append(strike, guess["t"])
+    guess["y"] = np.vstack([state, guess["y"]])
     found = guidance.optimise_remaining(rocket, remaining, guess, intervals[first:])
     return found | {"healthy": healthy, "strike": strike}
 
 
 def state_at(plan: dict, time: float) -> np.ndarray:
-    """r (m) and v (m/s), (6,), of an optimum of `optimise_remaining` at a time: its own polynomial of that interval."""
+    """r (m) and v (m/s), (6,), of an optimum of `optimise_remaining` at `time` (s), by its interval's polynomial."""
     from scipy.interpolate import BarycentricInterpolator
 
     size = len(guidance.GAUSS_POINTS) + 1  # the interval's begin, and its points
@@ -109,13 +113,13 @@ def state_at(plan: dict, time: float) -> np.ndarray:
 
 
 def remaining_after(vehicle: Vehicles, strike: float, state: np.ndarray, orbit) -> guidance.RemainingAscent:
-    """What is left of the ascent of one vehicle from its failure on, its last burn relaxed."""
+    """What is left of the ascent of one vehicle from its failure on, with a relaxed last burn (`RELAXED_MASS`)."""
     columns = (vehicle.end, vehicle.thrust, vehicle.flow, vehicle.dropped)
     end, thrust, flow, dropped = (column[:-1, 0] for column in columns)  # the arc without thrust is left out
     lost = flow * np.diff(end, prepend=0.0) + dropped
     mass = vehicle.mass[0] - np.append(0.0, np.cumsum(lost)[:-1])
     left = end > strike
-    begin = max(strike, end[-2])  # of the last arc
+    begin = max(strike, end[-2])  # s, when the last arc begins
     end = end[left]
     end[-1] = begin + (mass[-1] - RELAXED_MASS * vehicle.dry_mass[0]) / flow[-1]
     air = (vehicle.drag[0], vehicle.wind[0, 0], vehicle.wind[1, 0])
@@ -124,10 +128,11 @@ def remaining_after(vehicle: Vehicles, strike: float, state: np.ndarray, orbit) 
 
 
 def directions_at(optimum: dict, times: np.ndarray) -> np.ndarray:
-    """An optimum's directions (m, 3) at `times` (m,) in s: from the strike on those that know of the failure."""
+    """An optimum's directions (m, 3) at `times` (m,) in s. From the strike on they know of the failure."""
     if "strike" not in optimum:
         return guidance.directions_at(optimum, times)
-    before, after = (guidance.directions_at(plan, times) for plan in (optimum["healthy"], optimum))
+    before = guidance.directions_at(optimum["healthy"], times)
+    after = guidance.directions_at(optimum, times)
     return np.where((times < optimum["strike"])[:, None], before, after)
 
 
@@ -141,9 +146,9 @@ FLIGHTS_PER_PROCESS = 50  # a process takes two seconds to start, a flight a thi
 def failing_optima(
     env_id: str, mission: Mission, failing: Failing, z: np.ndarray, processes: int | None = None
 ) -> list:
-    """The optima of draws z (n, k + 4), as `solve_rescue` has them.
+    """The optima of draws z (n, k + 4), as `solve_rescue` returns them.
 
-    Shared out to `processes` (default: by the number of draws, at most the machine's), which changes only the time.
+    `processes` share the solves, which changes only the time. The default depends on the number of draws and cores.
     """
     guess = guidance.guess_of(kept_reference(env_id, mission))
     jobs = [(mission.rocket, failing, row, guess) for row in z]
@@ -154,19 +159,20 @@ def failing_optima(
 
 
 class Known(NamedTuple):
-    """What the optima of n flights leave that know of a failure from its strike on."""
+    """What is left by the optima of n flights that know of a failure from its strike on."""
 
-    mass: np.ndarray  # (n,) kg in the target orbit; NaN of healthy flights, and where no optimum was found
-    price: np.ndarray  # (n, 5) kg that a unit of each of the numbers of `orbit_defect` saves, NaN as the mass
+    mass: np.ndarray  # (n,) kg in the target orbit; NaN for healthy flights and without an optimum
+    price: np.ndarray  # (n, 5) kg that a unit of each number of `orbit_defect` saves; NaN as the mass
 
     def first(self, n: int) -> Known:
-        """Of the first n flights."""
+        """The same for the first n flights."""
         return Known(*(values[:n] for values in self))
 
     def mass_at(self, error: np.ndarray, rocket: Rocket) -> np.ndarray:
-        """The masses (n,) for the orbits of these terminal errors (n, 6), to first order.
+        """The masses (n,) in kg for the orbits with these terminal errors (n, 6), to first order.
 
-        Below an error of 0.001 within 0.1 kg, at 0.01 within 1.5 kg too much, of fourteen optima to orbits reached.
+        We compared them with fourteen optima to orbits that were reached. Below an error of 0.001 they agree within
+        0.1 kg. At an error of 0.01 they are up to 1.5 kg too large.
         """
         in_plane = error[:, 3:] @ target_axes(rocket)[:2].T
         return self.mass + (self.price * np.hstack([error[:, :3], in_plane])).sum(axis=1)
@@ -179,26 +185,27 @@ def solve_known(env_id: str, mission: Mission, failing: Failing, z: np.ndarray, 
     known = Known(np.full(len(z), np.nan), np.full((len(z), 5), np.nan))
     for k, optimum in zip(has_failed, failing_optima(env_id, mission, failing, z[has_failed], processes)):
         if optimum:
-            known.mass[k], known.price[k] = optimum["final_mass"], optimum["orbit_price"]
+            known.mass[k] = optimum["final_mass"]
+            known.price[k] = optimum["orbit_price"]
     return known
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What is known of the draws of a seed: stored, or solved once
+# The optima of a seed's draws: stored, or solved once
 # ---------------------------------------------------------------------------------------------------------------------
 
 STORED = RESULTS / "failure_optima"
 
 
 def about(env_id: str, mission: Mission, failing: Failing, eval_seed: int) -> str:
-    """What the optima of a seed's draws depend on: a stored file of the same words fits."""
+    """What the optima of a seed's draws depend on, in words. A stored file with the same words fits."""
     options = " ".join(f"{name} {value}" for name, value in failing._asdict().items())
     return f"{env_id} {options} eval_seed {eval_seed} {DISPERSION} {mission.rocket}"
 
 
 @lru_cache(maxsize=8)
 def known_optima(env_id: str, mission: Mission, failing: Failing, eval_seed: int, n: int) -> Known:
-    """`solve_known` of the first n draws of a seed, read from results/ where it is stored there."""
+    """`solve_known` of the first n draws of a seed. It is read from results/ if it is stored there."""
     known = stored_optima(about(env_id, mission, failing, eval_seed), n)
     if known is None:
         print(f"{env_id}: solving what can be saved of {n} flights with failures, once", file=sys.stderr, flush=True)
@@ -210,7 +217,7 @@ def known_optima(env_id: str, mission: Mission, failing: Failing, eval_seed: int
 
 
 def stored_optima(words: str, n: int) -> Known | None:
-    """Of the first n flights, from the file in results/ that is `about` these words; None where there is none."""
+    """The optima of the first n flights, from the file in results/ with these words of `about`; None without it."""
     for path in sorted(STORED.glob("*.npz")):
         try:
             with np.load(path) as file:

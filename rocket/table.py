@@ -10,7 +10,7 @@ from rocket.missions import Mission
 
 
 def table(metrics: dict, mission: Mission) -> str:
-    """The table of a rocket's evaluation; "-" where there is no number."""
+    """The table of a rocket's evaluation, with "-" for a number that there is not."""
     target = target_summary(mission.rocket)
     optimum = {key: metrics.get(f"reference_{key}") for _, key, _ in table_rows(mission)}
     optimum |= {"mass_ratio": 1.0, "mass_ratio_reached": 1.0}
@@ -33,7 +33,7 @@ def table(metrics: dict, mission: Mission) -> str:
 
 
 def cells(key: str, digits: int, target: float | None, optimum: float | None, ours: float | None) -> list[str]:
-    """Target, optimum, ours, and the difference of ours from the first of them that there is."""
+    """Target, optimum, the policy's number, and its difference from the target, or without one from the optimum."""
     compared = optimum if target is None else target
     numbers = ["-" if value is None else f"{value:.{digits}f}" for value in (target, optimum, ours)]
     if ours is None or compared is None:
@@ -42,7 +42,7 @@ def cells(key: str, digits: int, target: float | None, optimum: float | None, ou
 
 
 def remarks(metrics: dict, mission: Mission) -> list[str]:
-    """The lines below the rocket's table: what its numbers rest on, the return and its parts, the opponent."""
+    """The lines below the rocket's table: remarks on its numbers, the return and its parts, the opponent."""
     lines = []
     stopped = abs(metrics.get("a_error_km", math.inf)) < 1e-3  # a crash or an empty tank may come first
     if mission.cutoff and stopped:
@@ -83,7 +83,7 @@ def table_rows(mission: Mission) -> list[tuple[str, str, int]]:
 
 
 def dispersed_lines(metrics: dict) -> list[str]:
-    """The lines below the rocket's table on its dispersed flights; none where none were flown."""
+    """The lines below the rocket's table about dispersed flights. There are none without such flights."""
     if "dispersion" not in metrics or metrics["dispersed_starts"] == 0:
         return []
     n = metrics["dispersed_starts"]
@@ -107,7 +107,7 @@ def dispersed_lines(metrics: dict) -> list[str]:
 
 
 def failure_lines(metrics: dict) -> list[str]:
-    """The lines below the rocket's table on its flights with a failure; none where none were flown."""
+    """The lines below the rocket's table about flights with a failure. There are none without such flights."""
     if not metrics.get("failure"):
         return []
     when = {"random": "from a random moment of a burn on", "ignition": "from the last stage's ignition on"}

@@ -1,4 +1,4 @@
-"""What is asked of a rocket's id: see `common.tasks.Task`."""
+"""The rocket's family: its answers to what `common.tasks.Task` asks of an id."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class RocketTask:
         return cls(env_id, ROCKETS[env_id])
 
     def flown_with(self, **env_options) -> RocketTask:
-        """As the options `rocket` and `table_isp` of the environment have it flown."""
+        """The same task with the environment's options `rocket` and `table_isp`."""
         changed = {name: env_options[name] for name in ("rocket", "table_isp") if name in env_options}
         return replace(self, mission=flown_mission(self.mission, **changed))
 
@@ -69,7 +69,7 @@ class RocketTask:
         return {"draw": draws(self.flown_with(**env_options).mission.rocket, dispersion, eval_seed, n, failure)}
 
     def optimum(self, eval_seed: int, n: int, **env_options) -> dict:
-        """The nominal flight's, whatever is drawn; what can be saved of failures is solved, too, and remembered."""
+        """The optimum of the nominal flight, also with draws. With failures it also solves and keeps `known_optima`."""
         task = self.flown_with(**env_options)
         failing = Failing.of(env_options)
         if failing.failure:
@@ -87,11 +87,11 @@ class RocketTask:
         failure_time: str = "random",
         **env_options,
     ):
-        """Fly the nominal rocket once beside the optimum's flight; with `dispersion` or `failure` also n that differ.
+        """Fly the nominal rocket once beside the optimum. With `dispersion` or `failure` also fly n that differ.
 
         Without them seed and n are only noted. With the options `rocket` or `table_isp` the target and the optimum are
-        those of that rocket, too. Metrics that are not finite (the apogee of a hyperbola) or have no meaning are left
-        out.
+        those of that rocket. Metrics that are not finite (the apogee of a hyperbola) or have no meaning are left out.
+        Returns the metrics of eval.json and the arrays of eval.npz.
         """
         if reference is None:
             reference = self.optimum(eval_seed, n, **env_options)
@@ -122,9 +122,10 @@ class RocketTask:
         return options | failure_metrics(arrays, known.mass, reached, dry_mass)
 
     def saved_flight(self, policy, arrays: dict, failing: Failing, eval_seed: int, **env_options) -> dict:
-        """Of the saved flights the one that a failure made burn longest, flown again for the animation.
+        """Fly again, for the animation, the saved flight with a failure that burns longest.
 
-        Returns `t_saved` (K+1,), `u_saved` (K, 3), `y_saved` (K+1, 7) and `saved`, its number; {} where none is saved.
+        Returns `t_saved` (K+1,), `u_saved` (K, 3), `y_saved` (K+1, 7) and the flight's number `saved`. Without a saved
+        flight it returns {}.
         """
         known = known_optima(self.env_id, self.mission, failing, eval_seed, len(arrays["draw"]))
         vehicles = draw_vehicles(self.mission.rocket, failing.dispersion, arrays["draw"])
@@ -139,7 +140,7 @@ class RocketTask:
         return {f"{key}_saved": flight[key] for key in ("t", "u", "y")} | {"saved": np.array(k)}
 
     def reported_metrics(self, metrics: dict, timed_policy=None, **env_options) -> dict:
-        """The mass beside the optimum's for the orbit that was reached; of flights that differ a decision's time."""
+        """The mass beside the optimum's for the orbit that was reached. With draws also the time of a decision."""
         found = self.mass_reached(metrics)
         if has_draws(**env_options) and timed_policy is not None:
             found["decision_us"] = decision_us(self.env_id, timed_policy, **env_options)
@@ -148,8 +149,9 @@ class RocketTask:
     def mass_reached(self, metrics: dict) -> dict:
         """`mass_ratio_reached`: the final mass over `reference_mass_reached_kg`, the optimum's for the orbit reached.
 
-        `mass_ratio` compares two orbits: one a little off the target can be cheaper to reach. With cut-off and success
-        only, for it takes a solve of half a second and an orbit to solve for; without CasADi or a solution, no key.
+        `mass_ratio` compares masses in two orbits, and an orbit a little off the target can be cheaper to reach. This
+        ratio needs a solve of half a second and an orbit to solve for. So it is only for flights with cut-off and
+        success. Without CasADi or a solution there is no key.
         """
         if not self.mission.cutoff or not metrics["success"]:
             return {}
@@ -167,7 +169,7 @@ class RocketTask:
     def default_flights(self, is_brief: bool, **env_options) -> int:
         if has_draws(**env_options):
             return INTERIM_STARTS if is_brief else DISPERSED_STARTS
-        return 50 if is_brief else 1000  # noted alone: there is one start
+        return 50 if is_brief else 1000  # only noted, because there is one start
 
     def interim_flights(self, n: int, **env_options) -> int:
         return min(n, INTERIM_STARTS) if has_draws(**env_options) else n
@@ -247,7 +249,7 @@ class RocketTask:
         return figures
 
     def training_figure(self, metrics: dict, curves: list[dict]):
-        """The curves of a training, with the mean action's ||error||."""
+        """The training curves, with ||error|| of the mean action."""
         from drawing.training import Miss, training_figure
 
         label = "$\\Vert$error$\\Vert$ of the mean action"
@@ -298,7 +300,7 @@ class RocketTask:
     # --- commands
 
     def speed_cases(self) -> list[tuple[str, dict, list | None]]:
-        """Climbing: steered at random it falls back to the pad in its first steps."""
+        """The rocket climbs in these cases, because with random actions it falls back to the pad in its first steps."""
         local = {"action_frame": "local"}
         return [("", local, [1.0, 0.3, 0.0]), (", dispersed", {**local, "dispersion": 1}, [1.0, 0.3, 0.0])]
 
@@ -323,12 +325,12 @@ class RocketTask:
 
 
 def has_draws(dispersion: float = 0.0, failure: float = 0.0, **env_options) -> bool:
-    """Whether these options have flights differ from one another."""
+    """Whether flights differ from one another with these options."""
     return bool(dispersion or failure)
 
 
 def flights_shown(arrays: dict) -> dict[str, dict]:
-    """What the figure of dispersed flights shows: label -> arrays, healthy flights apart from the others."""
+    """What the figure of dispersed flights shows: {label: arrays}, with healthy and failed flights apart."""
     if "failure" not in arrays:
         return {"policy": arrays}
     ends = {key: arrays[key] for key in ("draw", "failure", "final_y", "final_error")}

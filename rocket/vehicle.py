@@ -1,7 +1,7 @@
-"""Vehicle, Earth and target orbit of a rocket: the tables, what is aboard when, and what cannot fly.
+"""Vehicle, Earth and target orbit of a rocket: the tables, what is aboard when, and which rockets cannot fly.
 
-Reading order: the tables (`Engine`, `Burn`, `Rocket`; `ROCKET` is the paper's), which engines burn together, what is
-dropped, the checks. A table of your own goes into `vehicles/`.
+Reading order: the tables (`Engine`, `Burn`, `Rocket`; `ROCKET` is the paper's), which engines burn and leave together,
+the checks. A table of your own goes into `vehicles/`.
 """
 
 from __future__ import annotations
@@ -15,23 +15,23 @@ import numpy as np
 from common.errors import is_finite, refuse_unless, refuse_unless_finite
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Tables (the paper's table "Vehicle Properties and Simulation Parameters", and where it rounds or has no row the
-# constants of the GPOPS-II benchmark that it is adapted from)
+# Tables (the paper's table "Vehicle Properties and Simulation Parameters". Where it rounds or has no row, we take the
+# constants of the GPOPS-II benchmark from which the paper adapted it)
 # ---------------------------------------------------------------------------------------------------------------------
 
 
 G0 = 9.80665  # m/s^2
-ISP_TOLERANCE = 0.02  # the paper's second stage, whose numbers contradict each other, differs by 0.0104
+ISP_TOLERANCE = 0.02  # the numbers of the paper's second stage contradict one another by 0.0104
 
 
 @dataclass(frozen=True)
 class Engine:
-    """One row block of the table: a solid booster or a stage.
+    """One row block of the table: a solid booster or a stage. Raises BadInput for an engine that cannot be.
 
-    Thrust, propellant and burn_time are flown; they make the specific impulse `flown_isp`. The table's `isp` is flown
-    in the place of the burn time with `table_isp` alone. A warning says where the two differ by more than 2 %.
+    Thrust, propellant and burn_time are flown. They give the specific impulse `flown_isp`. With `table_isp` the table's
+    `isp` is flown in place of the burn time. A warning says if the two differ by more than 2 %.
 
-    Two engines of equal numbers and names are one type: in dispersed flights they share their draws.
+    Two engines with equal numbers and names are one type. In dispersed flights they share their draws.
     """
 
     total_mass: float  # kg
@@ -59,19 +59,23 @@ class Engine:
 
     @property
     def flown_isp(self) -> float:
-        """s: thrust / (g0 flow) of the propellant over the burn time; 0 without thrust."""
-        return self.thrust * self.burn_time / (G0 * self.propellant) if self.thrust else 0.0
+        """Thrust / (g0 flow) in s, with the flow propellant / burn_time; 0 without thrust."""
+        if not self.thrust:
+            return 0.0
+        return self.thrust * self.burn_time / (G0 * self.propellant)
 
     def flow(self, table_isp: bool) -> float:
-        """Propellant flow in kg/s: propellant / burn time (the GPOPS-II benchmark's), or T / (g0 Isp) of the table."""
-        return self.thrust / (G0 * self.isp) if table_isp else self.propellant / self.burn_time
+        """Propellant flow in kg/s: propellant / burn_time as in the GPOPS-II benchmark, or thrust / (g0 isp)."""
+        if table_isp:
+            return self.thrust / (G0 * self.isp)
+        return self.propellant / self.burn_time
 
 
 @dataclass(frozen=True)
 class Burn:
     """A phase: the engines that burn until `end` and those that are dropped then, as (number, engine).
 
-    `Burn(end, ())` is a coast: nothing burns, and the thrust direction counts for nothing.
+    `Burn(end, ())` is a coast. Nothing burns in it, and the thrust direction does not count.
     """
 
     end: float  # s
@@ -119,9 +123,10 @@ STAGE_2 = Engine(total_mass=19300.0, propellant=16820.0, thrust=110094.0, isp=46
 
 @dataclass(frozen=True)
 class Rocket:
-    """The paper's rocket, Earth and target by default; a vehicle of your own is `Rocket(burns=..., payload=..., ...)`.
+    """A rocket with its planet and target orbit. The defaults are the paper's.
 
-    Raises BadInput, which names the field, where it cannot fly: see `check_rocket`.
+    A vehicle of your own is `Rocket(burns=..., payload=..., ...)`. Raises BadInput that names the field if the rocket
+    cannot fly (`check_rocket`).
     """
 
     burns: tuple[Burn, ...] = (
@@ -138,7 +143,7 @@ class Rocket:
     H: float = 7200.0  # m
     Cd: float = 0.5
     S: float = 4 * np.pi  # m^2
-    latitude: float = 28.5  # degrees, by our reading geocentric; the longitude is 0 (ours)
+    latitude: float = 28.5  # degrees, geocentric by our reading; the longitude is 0 by our choice
     a: float = 24361140.0  # m, target orbit
     e: float = 0.7308
     i: float = 28.5  # degrees
@@ -153,18 +158,17 @@ class Rocket:
 
     @property
     def body(self) -> str:
-        """What figures call the planet, by its gravitational parameter."""
+        """The planet's name in figures, by its gravitational parameter."""
         return "Earth" if abs(self.mu / 3.986e14 - 1) < 0.01 else "ground"
 
     @property
     def last_ignition(self) -> float:
-        """s: when the last burn begins."""
+        """The time in s at which the last burn begins."""
         return self.burns[-2].end if len(self.burns) > 1 else 0.0
 
     @property
     def x0(self) -> np.ndarray:
-        """The start (7,): r (m) and v (m/s) in ECI, at rest on the ground, and the mass (kg) of all that is dropped, of
-        the last stage and of the payload."""
+        """The start (7,): r (m) and v (m/s) in ECI, at rest on the ground, and the mass (kg) of the whole rocket."""
         latitude = np.radians(self.latitude)
         r = self.Re * np.array([np.cos(latitude), 0.0, np.sin(latitude)])
         parts = [*(part for burn in self.burns for part in burn.dropped), *self.burns[-1].engines]
@@ -173,7 +177,7 @@ class Rocket:
 
     @property
     def dry_mass(self) -> float:
-        """kg: what is left when the last stage has burnt all its propellant, the payload included."""
+        """The mass in kg of the empty last stage and the payload."""
         return self.payload + empty_mass(self.burns[-1].engines)
 
     @property
@@ -187,14 +191,15 @@ class Rocket:
         return -self.mu / (2 * self.a)
 
     def arcs(self) -> list[tuple[float, float, float, float, float]]:
-        """What is constant between events: (start s, end s, thrust N, flow kg/s, kg dropped at the end), in order.
+        """The times between events, in order: (start s, end s, thrust N, flow kg/s, kg dropped at the end) of each.
 
-        A last stage that runs dry before its phase ends gives an arc of its own without thrust.
+        If the last stage runs dry before its phase ends, a last arc without thrust follows.
         """
         arcs, start = [], 0.0
         for burn, dropped in zip(self.burns, self.jettison):
             flow = burn.flow(self.table_isp)
-            if burn is self.burns[-1] and self.table_isp and flow:  # without it the propellant covers all burns
+            may_run_dry = burn is self.burns[-1] and self.table_isp and flow  # else the propellant covers the burn
+            if may_run_dry:
                 dry = start + self.last_propellant / flow
                 if dry < burn.end - 1e-6:  # rounding alone is not an event
                     arcs.append((start, dry, burn.thrust, flow, 0.0))
@@ -205,15 +210,16 @@ class Rocket:
 
     @property
     def jettison(self) -> list[float]:
-        """kg that leave at the end of each burn: dry mass, and the propellant that the dropped engines have not burnt.
+        """The kg that leave at the end of each burn: dry mass, and propellant that the dropped engines have not burnt.
 
-        What others of their type burn later stays on board. With `table_isp` all of it does: so the paper's table,
-        which contradicts itself, is flown.
+        Propellant that other engines of the type burn later stays aboard. With `table_isp` all unburnt propellant stays
+        aboard. The paper's table contradicts itself and is flown in this way.
         """
         jettison = [float(empty_mass(burn.dropped)) for burn in self.burns]
         if self.table_isp:
             return jettison
-        used, aboard = propellant_used(self), engines_aboard(self, 0)
+        used = propellant_used(self)
+        aboard = engines_aboard(self, 0)
         spare = {engine: n * engine.propellant - used.get(engine, 0.0) for engine, n in aboard.items()}
         for group in engine_groups(self):
             burns_all = group.seconds_lit >= group.seconds_full * (1 - 1e-9)
@@ -228,7 +234,7 @@ class Rocket:
 
     @property
     def last_propellant(self) -> float:
-        """kg in the last burn's engines when it begins, each with its own tank: all, less what they burnt before."""
+        """The kg of propellant in the last burn's engines when it begins. Each has its own tank."""
         seconds = self.burns[-1].end - self.last_ignition
         return sum(
             group.number * (group.engine.propellant - group.engine.flow(self.table_isp) * (group.seconds_lit - seconds))
@@ -238,7 +244,7 @@ class Rocket:
 
 
 def delta_v(rocket: Rocket) -> float:
-    """m/s that all burns together give a rocket without gravity and drag: the sum of T / flow ln(m / (m - burnt))."""
+    """The velocity in m/s that all burns give without gravity and drag: the sum of T / flow ln(m / (m - burnt))."""
     mass, sum_of_arcs = rocket.x0[-1], 0.0
     for start, end, thrust, flow, dropped in rocket.arcs():
         burnt = flow * (end - start)
@@ -248,33 +254,34 @@ def delta_v(rocket: Rocket) -> float:
 
 
 def launch_raan(latitude: float, i: float) -> float:
-    """The node's right ascension (degrees, 0 to 360) of the plane of inclination i that holds the launch site at t = 0.
+    """The node's right ascension of the plane with inclination i that holds the launch site at t = 0.
 
-    The site's longitude is 0 (ours), so that RAAN = -arcsin(tan latitude / tan i), for a launch towards the north. A
-    target in another plane costs propellant: 1 degree at 7.7 km/s about 130 m/s times sin i.
+    All angles are in degrees, the result is from 0 to 360. The site's longitude is 0 by our choice. So for a launch
+    towards the north RAAN is -arcsin(tan latitude / tan i). A target in another plane costs propellant: at 7.7 km/s
+    1 degree costs about 130 m/s times sin i.
     """
-    with np.errstate(divide="ignore", invalid="ignore"):  # i = 0; from the equator every node will do
+    with np.errstate(divide="ignore", invalid="ignore"):  # i = 0, where every node suits a launch from the equator
         ratio = np.nan_to_num(np.tan(np.radians(latitude)) / np.tan(np.radians(i)), nan=0.0)
     return float(np.degrees(-np.arcsin(np.clip(ratio, -1, 1))) % 360)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Which engines are aboard, burn together and leave together. Parts are (number, engine), as in a `Burn`
+# Which engines are aboard, burn together and leave together. `parts` are (number, engine), as in a `Burn`
 # ---------------------------------------------------------------------------------------------------------------------
 
 
 def empty_mass(parts) -> float:
-    """kg of these engines without propellant."""
+    """The mass in kg of these engines without propellant."""
     return sum(n * (engine.total_mass - engine.propellant) for n, engine in parts)
 
 
 def number_of(engine: Engine, parts) -> float:
-    """How many of an engine are among these."""
+    """The number of engines in `parts` that equal `engine`."""
     return sum(n for n, other in parts if other == engine)
 
 
 def propellant_used(rocket: Rocket) -> dict[Engine, float]:
-    """kg of propellant that all engines of each type burn, if none runs dry."""
+    """The kg of propellant that all engines of each type burn, if none runs dry."""
     start, used = 0.0, {}
     for burn in rocket.burns:
         for number, engine in burn.engines:
@@ -285,7 +292,7 @@ def propellant_used(rocket: Rocket) -> dict[Engine, float]:
 
 
 def engines_aboard(rocket: Rocket, k: int) -> dict[Engine, float]:
-    """How many of each engine fly in burn k: those dropped at its end or later, and the last burn's."""
+    """The number of each engine that flies in burn k: those dropped at its end or later, and the last burn's."""
     dropped_later = [part for burn in rocket.burns[k:] for part in burn.dropped]
     aboard = {}
     for number, engine in [*dropped_later, *rocket.burns[-1].engines]:
@@ -294,7 +301,7 @@ def engines_aboard(rocket: Rocket, k: int) -> dict[Engine, float]:
 
 
 def engine_types(rocket: Rocket) -> tuple[Engine, ...]:
-    """The distinct engines in order of first ignition; behind them what is dropped without ever being lit."""
+    """The distinct engines in order of first ignition, then those that are dropped without ever being lit."""
     lit = [engine for burn in rocket.burns for _, engine in burn.engines]
     dropped = [engine for burn in rocket.burns for _, engine in burn.dropped]
     return tuple(dict.fromkeys([*lit, *dropped]))
@@ -306,10 +313,10 @@ class EngineGroup(NamedTuple):
     number: int
     engine: Engine
     type: int  # index in `engine_types`
-    dropped_after: int  # the burn at whose end they leave; of the last stage the last one
+    dropped_after: int  # the burn at whose end they leave; the last burn for the last stage
     burns: tuple[int, ...]  # the burns in which they are lit, the last first
-    seconds_lit: float  # s that each of them nominally burns
-    seconds_full: float  # s for which its nominal propellant lasts, infinite without a flow
+    seconds_lit: float  # s for which each of them nominally burns
+    seconds_full: float  # s for which the nominal propellant of each lasts, infinite without a flow
 
 
 def engine_groups(rocket: Rocket) -> tuple[EngineGroup, ...]:
@@ -329,9 +336,9 @@ def engine_groups(rocket: Rocket) -> tuple[EngineGroup, ...]:
 
 
 def burns_of_group(rocket: Rocket, engine: Engine, k: int) -> tuple[int, ...]:
-    """The burns, the last first, in which engines of a type are lit that leave after burn k.
+    """The burns in which the engines of a type that leave after burn k are lit, the last first.
 
-    Counted back to where all that burn are dropped: what burnt before that was another group.
+    They are counted back to a burn at whose end all burning engines of the type are dropped. Those are another group.
     """
     burns = []
     for j in range(k, -1, -1):
@@ -345,12 +352,12 @@ def burns_of_group(rocket: Rocket, engine: Engine, k: int) -> tuple[int, ...]:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What cannot fly is refused where it is made
+# A rocket that cannot fly is refused where it is made
 # ---------------------------------------------------------------------------------------------------------------------
 
 
 def check_rocket(rocket: Rocket):
-    """BadInput where a rocket cannot be; a warning where it can, at a price that is easily overlooked."""
+    """Raise BadInput for a rocket that cannot fly. Warn if its target costs much and this is easily overlooked."""
     for name in ("a", "e", "i", "raan", "argp"):
         allowed = "must be a number: all five elements are given; give a free one a value"
         refuse_unless(getattr(rocket, name) is not None, f"a rocket's {name}", None, allowed)
@@ -375,11 +382,11 @@ def check_rocket(rocket: Rocket):
     refuse_unless(thrust > weight, "the thrust of burns[0]", f"{thrust:.6g} N", allowed)
     if min(rocket.i, 180 - rocket.i) < abs(rocket.latitude):
         needs = f"below the launch latitude {rocket.latitude}: the plane can only be reached by a dog-leg"
-        warnings.warn(f"a rocket's i is {rocket.i} degrees, {needs}")  # noqa: B028 - from one place: it is said once
+        warnings.warn(f"a rocket's i is {rocket.i} degrees, {needs}")  # noqa: B028 - one place, so it is said once
 
 
 def check_burns(rocket: Rocket):
-    """BadInput where the burns are not in order, burn what is not aboard, or more than all engines of a type hold.
+    """Raise BadInput for burns that are out of order, or burn engines or propellant that are not aboard.
 
     With `table_isp` the last burn may run dry.
     """
