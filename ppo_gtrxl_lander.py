@@ -130,7 +130,7 @@ OURS = {
     "total_updates": 280,
     "num_envs": 1024,  # with fewer flights an update, the policy burns more
     "num_minibatches": 32,
-    "flights_per_start": 32,
+    "flights_per_start": "0:32 0.7:32 0.7001:16",  # more draws late
     "update_epochs": 4,
     "learning_rate": 3e-3,
     "lr_times_std": True,
@@ -151,8 +151,8 @@ MARS = {
     **OURS,
     # the first three prepare the policy for failures that are worse than those of the training
     "thrust_share": 0.8,  # the rest of the thrust is a reserve
-    "start_spread": 1.25,  # less thrust sideways is as if the pad were farther and the start faster
-    "wind": "0:0.7 0.8:0.7 1:0.2",  # a policy has to notice that its motion answers less than it expects
+    "start_spread": 1.5,  # less thrust sideways is as if the pad were farther and the start faster
+    "wind": 0.7,  # a policy has to notice that its motion answers less than it expects
     "longest_flight": 60.0,  # flights of learned policies take 45 s
 }
 ONE_START = {  # all flights of an update are compared
@@ -227,6 +227,7 @@ def describe(episodes, metrics):
 
 # Problem, ours: what only training changes ----------------------------------------------------------------------------
 ALOFT_PRICE = 20.0  # hovering above the pad must cost more than any miss
+SLOPE_HEIGHT = 10.0  # m; the published 2 m are the flight's last two decisions
 SINK_RATE = 0.8  # m/s; a policy that aims at rest on the ground can come to rest just above it and hover
 
 
@@ -238,11 +239,12 @@ def set_curriculum(envs, args, progress):
     """
     if isinstance(args.log_std, str):
         std = math.exp(value_at(args.log_std, progress))
-        envs.position_scale = max(100 * std, POSITION_SCALE)
+        envs.position_scale = max(30 * std, POSITION_SCALE)
         envs.speed_scale = max(10 * std, SPEED_SCALE)
     envs.fuel_price = value_at(args.fuel_weight, progress)
     envs.slope_price = value_at(args.slope_weight, progress)
     envs.aloft_price = ALOFT_PRICE
+    envs.slope_height = SLOPE_HEIGHT
     envs.sink_rate = SINK_RATE
     envs.failure_size = args.training_failure_size
     envs.thrust_share = args.thrust_share

@@ -55,6 +55,7 @@ class LanderVectorEnv(BatchedEnv):
     - `sink_rate` (m/s): the vertical speed at touchdown that counts as none
     - `thrust_share`: the share of the greatest thrust that a command may ask for
     - `start_spread`: a factor on the width of the starts along x and y
+    - `slope_height` (m): the height from which the slope is counted
     - `wind` (m/s^2): the amplitude of `sway`
 
     `final_info`: `episodic_return` (with the prices and scales of `rewards.py`), `position_error` (m), `speed` (m/s),
@@ -105,6 +106,7 @@ class LanderVectorEnv(BatchedEnv):
             self.observation_scale = np.append(self.observation_scale, np.ones(7))
         self.position_scale, self.speed_scale, self.sink_rate = POSITION_SCALE, SPEED_SCALE, 0.0
         self.fuel_price, self.aloft_price, self.slope_price = FUEL_PRICE, ALOFT_PRICE, SLOPE_PRICE
+        self.slope_height = SLOPE_HEIGHT
         self.thrust_share, self.start_spread, self.wind = 1.0, 1.0, 0.0
         self.draw = np.zeros((num_envs, len(DRAW)))
         self.flights = self._drawn(self.draw)
@@ -114,7 +116,7 @@ class LanderVectorEnv(BatchedEnv):
         self._ended = np.zeros(num_envs, dtype=bool)
         self._ticks = np.zeros(num_envs, dtype=np.int64)  # periods flown
         self.time = np.zeros(num_envs)  # s
-        self._above = self.r.copy()  # the last position that was more than `SLOPE_HEIGHT` up
+        self._above = self.r.copy()  # the last position that was more than `slope_height` up
         self._nearest = np.full(num_envs, np.inf)  # m, the least range so far
 
     @property
@@ -259,7 +261,7 @@ class LanderVectorEnv(BatchedEnv):
             self._ticks += 1
         self.r, self.v, self.mass = r, v, mass
         self.time = self.time + length
-        is_high = r[2] > SLOPE_HEIGHT
+        is_high = r[2] > self.slope_height
         self._above = np.where(is_high, r, self._above)
         self.down = self.down | touches
         self._ended = self._ended | touches | self._is_over()
@@ -283,7 +285,7 @@ class LanderVectorEnv(BatchedEnv):
         return np.sqrt((self.v * self.v).sum(axis=0))
 
     def slope(self) -> np.ndarray:
-        """Fall over run (N,) from the last sampled position more than 2 m up. It is the published glide slope."""
+        """Fall over run (N,) from the last sampled position above `slope_height`. From 2 m it is the published one."""
         dx, dy, dz = self._above - self.r
         return dz / np.maximum(np.hypot(dx, dy), 1e-9)
 
@@ -350,6 +352,7 @@ class LanderEnv(SingleEnv):
     fuel_price = of_batch("fuel_price", "Reward lost for 100 kg of propellant.")
     aloft_price = of_batch("aloft_price", "Reward lost where a flight ends in the air.")
     slope_price = of_batch("slope_price", "Weight of `slope_reward`.")
+    slope_height = of_batch("slope_height", "Height (m) from which the slope is counted.")
     thrust_share = of_batch("thrust_share", "Share of the greatest thrust that a command may ask for.")
     start_spread = of_batch("start_spread", "Factor on the width of the starts, along x and y.")
     wind = of_batch("wind", "Amplitude (m/s^2) of an acceleration along x and y that comes and goes.")
