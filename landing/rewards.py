@@ -18,7 +18,7 @@ FAST = 5.0  # m/s
 FUEL_PRICE = 1.0  # for 100 kg
 ALOFT_PRICE = 10.0  # for a flight that ends in the air
 SLOPE_PRICE = 2.0
-STEEP = 10.0  # a steeper slope pays no more
+STEEP = 20.0  # a steeper slope pays no more
 FLATTEST = 0.05  # a flatter slope costs no more
 
 
@@ -39,5 +39,5 @@ def terminal_reward(position_error, speed, position_scale, speed_scale):
 
 
 def slope_reward(slope, price):
-    """-price ln(10 / slope), at most 0. Each doubling of a flat slope pays the same, well beyond the limit of 5."""
+    """-price ln(20 / slope), at most 0. Each doubling of a flat slope pays the same, well beyond the limit of 5."""
     return -price * np.log(np.maximum(STEEP / np.maximum(slope, FLATTEST), 1.0))
