@@ -190,9 +190,25 @@ def test_the_slope_is_that_of_the_last_two_metres():
 
 
 def test_the_slope_pays_by_doublings():
-    """Steeper than 10 : 1 pays nothing more; half as steep costs ln 2 of the price each time, down to 1 : 20."""
-    slope = np.array([1e9, 10.0, 5.0, 2.5, 0.05, 0.0])
-    assert slope_reward(slope, 2.0) == pytest.approx(-2 * np.log([1.0, 1.0, 2.0, 4.0, 200.0, 200.0]))
+    """Steeper than 20 : 1 pays nothing more; half as steep costs ln 2 of the price each time, down to 1 : 20."""
+    slope = np.array([1e9, 20.0, 10.0, 5.0, 0.05, 0.0])
+    assert slope_reward(slope, 2.0) == pytest.approx(-2 * np.log([1.0, 1.0, 2.0, 4.0, 400.0, 400.0]))
+
+
+def test_training_may_count_the_slope_from_higher_up():
+    """On a straight line at 6 : 1 the slope is the same from any height; from 40 m up it starts where the flight does."""
+    slopes = []
+    for height in (2.0, 10.0, 40.0):
+        batch = gym.make_vec(ID, num_envs=1)
+        batch.unwrapped.slope_height = height
+        batch.reset(options={"draw": MIDDLE, "x0": [[5.0, 0, 30.0, -5 / 6, 0, -5.0]]})
+        ended = np.zeros(1, dtype=bool)
+        sideways = batch.r[0].copy()
+        while not ended.all():
+            _, _, ended, final = batch.advance(up(batch, 3.7114 * 2000))
+        slopes.append(float(final["slope"][0]))
+    assert slopes == pytest.approx([6.0, 6.0, 6.0], rel=0.03)
+    assert 30.0 / (sideways - final["final_y"][0, 0]) == pytest.approx(slopes[2])
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -114,10 +114,14 @@ def test_the_script_trains_evaluates_and_publishes(tmp_path, monkeypatch, capsys
 
 
 def test_training_meets_failures_of_another_size():
-    """As published: of size 2 in training, of 2.5 in evaluations."""
+    """As published: of size 2 in training, of 2.5 in evaluations. Ours: more often, but never where none are asked for."""
     args = script.Args(**script.OURS)
     batch = gym.make_vec(ID, num_envs=args.num_envs)
     script.set_curriculum(batch, args, 0.0)
     batch.reset(seed=0)
     assert batch.flights.failed.min() == 0.5
     assert gym.make_vec(ID, num_envs=1).failure_size == 2.5
+    for asked, trained in ((0.5, 0.8), (0.0, 0.0), (1.0, 1.0)):
+        args = script.Args(**script.MARS, failure_probability=asked)
+        script.set_curriculum(batch, args, 0.0)
+        assert batch.failure_probability == trained
