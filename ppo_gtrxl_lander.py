@@ -665,7 +665,7 @@ def value_at(schedule, progress):
     from there on.
     """
     if not isinstance(schedule, str):
-        return schedule
+        return float(schedule)
     points = [point.split(":") for point in schedule.split()]
     places = [float(place) for place, _ in points]
     values = [float(value) for _, value in points]

@@ -532,12 +532,13 @@ def test_log_std_of_a_checkpoint_and_of_the_user(trained, fresh_folder, monkeypa
     flags = {
         "kept": ["--recipe=paper"],
         "learned": ["--recipe=paper", "--log-std=-1.5"],
+        "whole": ["--recipe=paper", "--log-std=0"],
         "set": ["--log-std", "0:-2", "1:-3"],
     }
     for name, argv in flags.items():
         fresh_folder(name)
         DI.main([*TINY, f"--checkpoint={checkpoint}", "--total-updates=1", *argv])
-    assert seen == [safetensors.torch.load_file(checkpoint)["actor_logstd"].item(), -1.5, -2.0]
+    assert seen == [safetensors.torch.load_file(checkpoint)["actor_logstd"].item(), -1.5, 0.0, -2.0]
 
 
 def test_eval_every_uses_starts_of_its_own(tmp_path, monkeypatch):
