@@ -196,7 +196,7 @@ def test_the_slope_pays_by_doublings():
 
 
 def test_training_may_count_the_slope_from_higher_up():
-    """On a straight line at 6 : 1 the slope is the same from any height; from 40 m up it starts where the flight does."""
+    """On a line at 6 : 1 the slope is the same from any height; from 40 m up it begins where the flight does."""
     slopes = []
     for height in (2.0, 10.0, 40.0):
         batch = gym.make_vec(ID, num_envs=1)

@@ -114,7 +114,7 @@ def test_the_script_trains_evaluates_and_publishes(tmp_path, monkeypatch, capsys
 
 
 def test_training_meets_failures_of_another_size():
-    """As published: of size 2 in training, of 2.5 in evaluations. Ours: more often, but never where none are asked for."""
+    """As published: of size 2 in training, of 2.5 in evaluations. Ours: more often, except where none are asked for."""
     args = script.Args(**script.OURS)
     batch = gym.make_vec(ID, num_envs=args.num_envs)
     script.set_curriculum(batch, args, 0.0)
