@@ -141,8 +141,8 @@ def keep_excerpt(path, task):
 
 def of_another_policy(folder) -> list[str]:
     """The files of a folder's old policy, beside the three files. They would look current beside a new policy."""
-    figures = [path for path in (folder / "figures").glob("*") if path.is_file()]
-    return ["opponents.json", "opponents.npz", "page.html", *(f"figures/{path.name}" for path in figures)]
+    figures = [f"figures/{path.name}" for path in (folder / "figures").glob("*") if path.is_file()]
+    return [*(path.name for path in folder.glob("opponents*")), "page.html", *figures]
 
 
 def move(staged, folder, last, replaced):

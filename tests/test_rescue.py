@@ -495,7 +495,7 @@ def compared(tmp_path_factory):
 @pytest.mark.slow
 def test_opponents_meet_the_same_failures(compared, capsys):
     folder, flown = compared
-    report = json.loads((folder / "opponents.json").read_text())
+    report = json.loads((folder / "opponents_at_ignition.json").read_text())
     assert (report["failure"], report["failure_time"]) == (0.2, "ignition")
     z = draws(ROCKET, 1.0, 3, 10, 0.2)
     has_failed = z[:, SCORES] < 0.5
@@ -519,13 +519,13 @@ def test_opponents_meet_the_same_failures(compared, capsys):
         assert sum(savable) == law["failure_savable"]
         assert by_loss["0"][name]["savable"] == law["dispersed_starts"]
     assert lines[-len(report["laws"]) - 1].startswith("  above 15% lost")
-    assert (folder / "figures" / "opponents_by_loss.png").stat().st_size > 10_000
+    assert (folder / "figures" / "opponents_at_ignition_by_loss.png").stat().st_size > 10_000
 
 
 @pytest.mark.slow
 def test_opponents_keep_what_rows_by_size_need(compared):
     folder, flown = compared
-    with np.load(folder / "opponents.npz") as file:
+    with np.load(folder / "opponents_at_ignition.npz") as file:
         arrays = {key: file[key] for key in file.files}
     assert arrays["failure"].shape == (10, 3)
     has_failed = arrays["failure"][:, 0] >= 0
