@@ -121,8 +121,8 @@ def room(base: float, values: np.ndarray) -> float:
 # The GIF
 # ---------------------------------------------------------------------------------------------------------------------
 
-FRAMES, FRAME_MS, HOLD_MS = 130, 80, 2000  # the last frame is held; a GIF counts in hundredths of a second
-COLOURS = 96  # colours of the one palette of all frames, so that none flickers and still parts take no bytes
+FRAMES, FRAME_MS, HOLD_MS = 110, 80, 2000  # the last frame is held; a GIF counts in hundredths of a second
+COLOURS = 48  # colours of the one palette of all frames, so that none flickers and still parts take no bytes
 
 
 class Animation(NamedTuple):
