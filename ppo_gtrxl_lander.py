@@ -113,6 +113,7 @@ class Args:
     slope_weight: Schedule = 2.0  # weight of a flat last descent in training (`slope_reward` of landing/rewards.py)
     training_failure_size: float = 2.0  # --failure-size in training, as published
     failure_emphasis: float = 1.0  # factor on --failure-probability in training
+    failed_fuel_share: float = 1.0  # share of --fuel-weight that flights with a failure pay
     thrust_share: float = 1.0  # share of the greatest thrust that training may ask for
     start_spread: float = 1.0  # factor on the width of the starts in training, along x and y
     wind: Schedule = 0.0  # amplitude (m/s^2) of a sideways acceleration in training that comes and goes
@@ -150,8 +151,9 @@ OURS = {
 }
 MARS = {
     **OURS,
-    # the first four prepare the policy for failures that are worse than those of the training
+    # the first five prepare the policy for failures that are worse than those of the training
     "failure_emphasis": 1.2,  # six flights in ten fail
+    "failed_fuel_share": 0.5,  # they need a reserve of propellant, healthy flights need none
     "thrust_share": 0.8,  # the rest of the thrust is a reserve
     "start_spread": 1.5,  # less thrust sideways is as if the pad were farther and the start faster
     "wind": 0.7,  # a policy has to notice that its motion answers less than it expects
@@ -244,6 +246,7 @@ def set_curriculum(envs, args, progress):
         envs.position_scale = max(30 * std, POSITION_SCALE)
         envs.speed_scale = max(10 * std, SPEED_SCALE)
     envs.fuel_price = value_at(args.fuel_weight, progress)
+    envs.failed_fuel_share = args.failed_fuel_share
     envs.slope_price = value_at(args.slope_weight, progress)
     envs.aloft_price = ALOFT_PRICE
     envs.slope_height = SLOPE_HEIGHT

@@ -93,7 +93,8 @@ RANGES = {  # lowest and highest value of every numeric flag; NaN and infinity a
     **{"eval_starts": (10, 10**6), "num_blocks": (0, 64), "memory_length": (0, 8192)},
     **{"flights_per_start": (1, 10**6), "dispersion": (0.0, 10.0), "weight_average": (0.0, 0.99999)},
     **{"failure_probability": (0.0, 1.0), "decision_s": (0.2, 10.0), "longest_flight": (1.0, 1000.0)},
-    **{"failure_size": (1.0, 100.0), "training_failure_size": (1.0, 100.0), "failure_emphasis": (0.0, 10.0)},
+    **dict.fromkeys(["failure_size", "training_failure_size"], (1.0, 100.0)),
+    **{"failure_emphasis": (0.0, 10.0), "failed_fuel_share": (0.0, 1.0)},
     **{"thrust_share": (0.2, 1.0), "start_spread": (0.0, 2.0), "wind": (0.0, 10.0), "action_hold": (1.0, 500.0)},
     "failure": (0.0, 0.3),
 }

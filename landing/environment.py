@@ -56,6 +56,7 @@ class LanderVectorEnv(BatchedEnv):
     - `thrust_share`: the share of the greatest thrust that a command may ask for
     - `start_spread`: a factor on the width of the starts along x and y
     - `slope_height` (m): the height from which the slope is counted
+    - `failed_fuel_share`: the share of `fuel_price` that flights with a failure pay
     - `wind` (m/s^2): the amplitude of `sway`
 
     `final_info`: `episodic_return` (with the prices and scales of `rewards.py`), `position_error` (m), `speed` (m/s),
@@ -106,7 +107,7 @@ class LanderVectorEnv(BatchedEnv):
             self.observation_scale = np.append(self.observation_scale, np.ones(7))
         self.position_scale, self.speed_scale, self.sink_rate = POSITION_SCALE, SPEED_SCALE, 0.0
         self.fuel_price, self.aloft_price, self.slope_price = FUEL_PRICE, ALOFT_PRICE, SLOPE_PRICE
-        self.slope_height = SLOPE_HEIGHT
+        self.slope_height, self.failed_fuel_share = SLOPE_HEIGHT, 1.0
         self.thrust_share, self.start_spread, self.wind = 1.0, 1.0, 0.0
         self.draw = np.zeros((num_envs, len(DRAW)))
         self.flights = self._drawn(self.draw)
@@ -225,7 +226,8 @@ class LanderVectorEnv(BatchedEnv):
         for _ in range(self._hold):
             self._fly(command)
         self.t += 1
-        rewards = -self.fuel_price / 100 * (burnt - self.mass)
+        price = self.fuel_price * np.where(np.isfinite(self.flights.strike), self.failed_fuel_share, 1.0)
+        rewards = -price / 100 * (burnt - self.mass)
         if self._ended.any():
             end = np.where(self.down, slope_reward(self.slope(), self.slope_price), -self.aloft_price)
             speed_error = np.sqrt(self.v[0] ** 2 + self.v[1] ** 2 + (self.v[2] + self.sink_rate) ** 2)
@@ -353,6 +355,7 @@ class LanderEnv(SingleEnv):
     aloft_price = of_batch("aloft_price", "Reward lost where a flight ends in the air.")
     slope_price = of_batch("slope_price", "Weight of `slope_reward`.")
     slope_height = of_batch("slope_height", "Height (m) from which the slope is counted.")
+    failed_fuel_share = of_batch("failed_fuel_share", "Share of `fuel_price` that flights with a failure pay.")
     thrust_share = of_batch("thrust_share", "Share of the greatest thrust that a command may ask for.")
     start_spread = of_batch("start_spread", "Factor on the width of the starts, along x and y.")
     wind = of_batch("wind", "Amplitude (m/s^2) of an acceleration along x and y that comes and goes.")
