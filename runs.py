@@ -472,7 +472,7 @@ def load_checkpoint(agent, args, saved):
         fail(f"--checkpoint {args.checkpoint}: does not fit its own args, BUFFERS or features ({why}); {todo}")
     for name, constant in constants_of(agent).items():
         if not torch.allclose(constant.cpu(), torch.from_numpy(saved["tensors"][name]), rtol=1e-6):
-            print(f"--checkpoint {args.checkpoint}: its {name} is not that of {args.env_id} now; it flies by its own")
+            print(f"--checkpoint {args.checkpoint}: {args.env_id} has another {name} now; the policy keeps its own")
             break
     try:
         agent.load_state_dict({name: torch.from_numpy(array) for name, array in saved["tensors"].items()})
