@@ -162,6 +162,9 @@ DISPERSED = {  # replaces values of the recipe above; training begins with a pol
     "mass_weight": "0.1:0 0.2:0.2 0.5:0.2 0.85:0",
     "weight_average": 0.998,
 }
+FAILING = {  # replaces values of DISPERSED; rare failures are forgotten if training moves the policy far
+    "log_std": "0:-4.5 1:-6.5",
+}
 RECIPES = {"RocketAscent-v0": FIXED, "RocketAscentCutoff-v0": CUTOFF, "TwoStageLEO-v0": CUTOFF}
 FIRST_POLICY = {  # the policy with which a dispersed training begins, by environment id
     "RocketAscent-v0": "results/rocket_fixed/agent.safetensors",
@@ -195,7 +198,8 @@ def recipe(args):
         todo = f"train without {flag} first, and name that policy by --checkpoint"
         print(f"{flag}: no policy of {args.env_id} to begin with, so this training begins anew; better {todo}")
         return {**changes, "num_envs": DISPERSED["num_envs"], "flights_per_start": DISPERSED["flights_per_start"]}
-    return {**changes, **DISPERSED, "checkpoint": first_policy}
+    changes = {**changes, **DISPERSED, "checkpoint": first_policy}
+    return {**changes, **FAILING} if args.failure else changes
 
 
 # Problem: input and action (features, frame and first action are ours) ------------------------------------------------
@@ -396,7 +400,7 @@ def before_training(agent, args, env_options):
 
 
 def widen_differences(agent):
-    """Let a policy see ten times as large differences of the orbit before they are clipped.
+    """Let a policy see ten times as large differences of the orbit, and twice as large ones of the angle.
 
     The units of the differences grow, and the weights of these inputs grow by the same factor. So the policy flies as
     before within the narrow clip, and its answer goes on linearly beyond it.
