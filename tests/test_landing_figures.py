@@ -6,7 +6,7 @@ import pytest
 from matplotlib.colors import to_hex
 
 import envs
-from drawing.animation import SIDES
+from drawing.animation import FRAMES, SIDES
 from landing import figures
 from landing.animation import DescentSheet, descent_animation
 from landing.environment import limited
@@ -254,7 +254,7 @@ def test_animation_shows_a_failed_flight_beside_its_optimum(arrays):
     for time in (strike - 0.3, strike + 0.3):
         animation.sheet.show([ours.until(time)], [best.until(time)])
         assert (f"failure at {strike:.1f} s" in animation.sheet.clock.get_text()) == (time > strike)
-    frames = [animation.frame(k) for k in (0, 40, 129)]
+    frames = [animation.frame(k) for k in (0, 40, FRAMES - 1)]
     assert all(frame.shape == SHAPE and frame.dtype == np.uint8 for frame in frames)
     assert (frames[0] != frames[1]).any() and (frames[1] != frames[2]).any()
     miss = np.linalg.norm(arrays["final_y"][row, :3])
