@@ -113,6 +113,18 @@ def test_the_script_trains_evaluates_and_publishes(tmp_path, monkeypatch, capsys
     capsys.readouterr()
 
 
+def test_failed_flights_may_pay_a_share_of_the_propellant():
+    batch = gym.make_vec(ID, num_envs=2, failure_probability=0.5)
+    draw = np.full((2, 13), 0.5)
+    draw[:, 10] = 0.9, 0.1  # healthy, failed
+    rewards = []
+    for share in (1.0, 0.5):
+        batch.failed_fuel_share = share
+        batch.reset(options={"draw": draw})
+        rewards.append(batch.step(np.tile([0.0, 0.0, 0.5], (2, 1)))[1])
+    assert rewards[1] == pytest.approx(rewards[0] * [1.0, 0.5], rel=1e-12)
+
+
 def test_training_meets_failures_of_another_size():
     """As published: of size 2 in training, of 2.5 in evaluations. Ours: more often, except where none are asked for."""
     args = script.Args(**script.OURS)
