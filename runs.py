@@ -11,6 +11,7 @@ import copy
 import ctypes
 import gc
 import hashlib
+import importlib
 import importlib.util
 import io
 import json
@@ -98,6 +99,7 @@ RANGES = {  # lowest and highest value of every numeric flag; NaN and infinity a
     **{"thrust_share": (0.2, 1.0), "start_spread": (0.0, 2.0), "wind": (0.0, 10.0), "action_hold": (1.0, 500.0)},
     "failure": (0.0, 0.3),
 }
+ROOT = Path(__file__).resolve().parent
 RECIPE_WORDS = ("ours", "paper")
 NETWORK = ("num_blocks", "embed_dim", "num_heads", "memory_length", "mlp_dim", "hidden_dim")
 # environment options that every run and evaluation chooses anew
@@ -271,7 +273,7 @@ def take_checkpoint_args(args, kind, typed, env_options, buffers):
 
 def check_values(args, env_ids):
     """Refuse a number that is out of its range, and a word that its flag does not take."""
-    check_word(args, "env_id", env_ids)
+    check_env_id(args, env_ids)
     choices = {"recipe": RECIPE_WORDS}
     if args.env_id in known_ids():  # `check_buffers` refuses an unknown id
         choices |= task_of(args.env_id).choices()
@@ -287,6 +289,20 @@ def check_values(args, env_ids):
             refuse(name, value, f"must be between {low} and {high}")
     if not all(number.is_integer() for number in schedule_values("flights_per_start", args.flights_per_start)):
         refuse("flights_per_start", args.flights_per_start, "must be whole numbers")
+
+
+def check_env_id(args, env_ids):
+    """Refuse an --env-id that the script does not have, and name the script that trains it if there is one."""
+    if args.env_id in env_ids:
+        return
+    others = "".join(f"; {name}.py trains {args.env_id}" for name in scripts_with(args.env_id))
+    refuse("env_id", args.env_id, f"must be one of {', '.join(env_ids)}{others}")
+
+
+def scripts_with(env_id):
+    """The names of the scripts that have this environment."""
+    names = sorted(path.stem for path in ROOT.glob("ppo_gtrxl_*.py"))
+    return [name for name in names if env_id in importlib.import_module(name).ENV_IDS]
 
 
 def check_word(args, name, words):

@@ -208,6 +208,16 @@ def test_help_shows_what_would_be_trained(capsys, script):
         assert re.search(rf"--total-updates INT number of updates \(default: {args['total_updates']}\)", words)
 
 
+@pytest.mark.parametrize(
+    "env_id, trainer", [("PendulumUpright-v0", "vdp"), ("MarsLanding-v0", "lander"), ("No-v0", None)]
+)
+def test_an_environment_of_another_script_is_refused_with_that_scripts_name(env_id, trainer):
+    with pytest.raises(SystemExit) as stop:
+        parse("--env-id", env_id, script=DI)
+    ours = f"error: --env-id {env_id}: must be one of DoubleIntegrator-v0, DoubleIntegratorWaypoints-v0"
+    assert stop.value.code == ours + (f"; ppo_gtrxl_{trainer}.py trains {env_id}" if trainer else "")
+
+
 def dispersed(*argv):
     return parse("--env-id=RocketAscentCutoff-v0", "--dispersion=1", *argv, script=ROCKET)
 
