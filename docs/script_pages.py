@@ -20,6 +20,7 @@ ROWS = {  # page: result folder -> its name
         "rocket_fixed": "961 s",
         "rocket_cutoff": "Cut-off",
         "rocket_dispersed": "Cut-off, dispersed",
+        "rocket_failures": "Cut-off, dispersed, losses of thrust",
         "two_stage_leo": "Two stages",
     },
     "ppo_gtrxl_lander": {"mars_landing": "Mars landing"},

@@ -26,7 +26,8 @@ PAGES = [ROOT / f"{name}.md" for name in ("README", "CHANGELOG", "CONTRIBUTING",
 PAGES += sorted((ROOT / "docs").rglob("*.md"))
 PAGES += sorted((ROOT / "results").rglob("README.md"))  # they hold the commands of all results
 each_page = pytest.mark.parametrize("page", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
-ROCKETS = ("rocket_fixed", "rocket_cutoff", "rocket_dispersed", "two_stage_leo")
+ROCKETS = ("rocket_fixed", "rocket_cutoff", "rocket_dispersed", "rocket_failures", "two_stage_leo")
+GO_ON_FROM = {"rocket_dispersed": ["rocket_cutoff"], "rocket_failures": ["rocket_cutoff", "rocket_dispersed"]}
 LANDERS = ("mars_landing",)
 OTHERS = ("di", "vdp", "di_waypoints", "vdp_waypoints")
 COUNTS = {1: "one", 2: "two", 3: "three", 4: "four", 5: "five"}
@@ -143,6 +144,9 @@ def measured(result, found):
     if result in LANDERS:
         here = [(100 * found["landed_rate"], 2, " %"), (found["position_error_mean_m"], 2, " m")]
         return [(found["reference_fuel_mean_kg"], 1, " kg")], [*here, (found["fuel_ratio"], 3, "")]
+    if "failure_saved_rate" in found:
+        here = [(100 * found["failure_saved_rate"], 1, " %"), (found["failure_error_median"], 5, "")]
+        return [([100.0], 0, " %")], [*here, (found["failure_mass_short_mean_kg"], 1, " kg")]
     optimum, here = [(found["reference_error_norm"], 6, "")], [(found["error_norm"], 6, "")]
     if "dispersed_error_median" in found:
         best = json.loads((ROOT / "results" / result / "opponents.json").read_text())["laws"]["optimum"]
@@ -183,8 +187,7 @@ def test_the_front_page_says_what_the_results_hold(result):
     assert row["seeds"] == COUNTS[count]
     *before, minutes = row["minutes"].split(" + ")
     assert minutes == f"{np.median(found['wall_seconds']) / 60:.0f}"
-    goes_on_from = [row_of("rocket_cutoff")["minutes"]] if result == "rocket_dispersed" else []
-    assert before == goes_on_from
+    assert before == [row_of(name)["minutes"].split(" + ")[-1] for name in GO_ON_FROM.get(result, [])]
     for column, figures in zip(("optimum", "here"), measured(result, found)):
         numbers = numbers_of(row[column])
         medians = [f"{np.median(values):.{digits}f}{unit}" for values, digits, unit in figures]
