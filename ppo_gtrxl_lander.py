@@ -114,9 +114,9 @@ class Args:
     training_failure_size: float = 2.0  # --failure-size in training, as published
     failure_emphasis: float = 1.0  # factor on --failure-probability in training
     failed_fuel_share: float = 1.0  # share of --fuel-weight that flights with a failure pay
-    failed_thrust_share: float = 1.0  # share of the greatest thrust that failed flights may ask for in training
+    thrust_share: float = 1.0  # share of the greatest thrust that training may ask for
     start_spread: float = 1.0  # factor on the width of the starts in training, along x and y
-    wind: Schedule = 0.0  # amplitude (m/s^2) of a push on failed flights in training that comes and goes
+    wind: Schedule = 0.0  # amplitude (m/s^2) of a sideways acceleration in training that comes and goes
     action_hold: Schedule = 1.0  # training holds an action for this many times --decision-s
     weight_average: float = 0.0  # decay, per optimiser step, of the averaged weights used in evaluation
 
@@ -153,8 +153,8 @@ MARS = {
     **OURS,
     # the first five prepare the policy for failures that are worse than those of the training
     "failure_emphasis": 1.2,  # six flights in ten fail
-    "failed_fuel_share": 0.25,  # and need a reserve of propellant; healthy flights need none
-    "failed_thrust_share": 0.8,  # the rest of their thrust is a reserve
+    "failed_fuel_share": 0.25,  # they need a reserve of propellant, healthy flights need none
+    "thrust_share": 0.8,  # the rest of the thrust is a reserve
     "start_spread": 1.5,  # less thrust sideways is as if the pad were farther and the start faster
     "wind": 0.7,  # a policy has to notice that its motion answers less than it expects
     "longest_flight": 60.0,  # flights of learned policies take 45 s
@@ -253,7 +253,7 @@ def set_curriculum(envs, args, progress):
     envs.sink_rate = SINK_RATE
     envs.failure_probability = min(args.failure_emphasis * args.failure_probability, 1.0)
     envs.failure_size = args.training_failure_size
-    envs.failed_thrust_share = args.failed_thrust_share
+    envs.thrust_share = args.thrust_share
     envs.start_spread = args.start_spread
     envs.wind = value_at(args.wind, progress)
     hold = value_at(args.action_hold, progress) * args.decision_s / PERIOD

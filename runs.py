@@ -96,7 +96,7 @@ RANGES = {  # lowest and highest value of every numeric flag; NaN and infinity a
     **{"failure_probability": (0.0, 1.0), "decision_s": (0.2, 10.0), "longest_flight": (1.0, 1000.0)},
     **dict.fromkeys(["failure_size", "training_failure_size"], (1.0, 100.0)),
     **{"failure_emphasis": (0.0, 10.0), "failed_fuel_share": (0.0, 1.0)},
-    **{"failed_thrust_share": (0.2, 1.0), "start_spread": (0.0, 2.0), "wind": (0.0, 10.0), "action_hold": (1.0, 500.0)},
+    **{"thrust_share": (0.2, 1.0), "start_spread": (0.0, 2.0), "wind": (0.0, 10.0), "action_hold": (1.0, 500.0)},
     "failure": (0.0, 0.3),
 }
 ROOT = Path(__file__).resolve().parent

@@ -53,11 +53,11 @@ class LanderVectorEnv(BatchedEnv):
     `slope_reward` on the ground, or -`aloft_price` in the air. Only training changes these prices and scales, and
 
     - `sink_rate` (m/s): the vertical speed at touchdown that counts as none
-    - `failed_thrust_share`: the share of the greatest thrust that a command may ask for in a flight with a failure
+    - `thrust_share`: the share of the greatest thrust that a command may ask for
     - `start_spread`: a factor on the width of the starts along x and y
     - `slope_height` (m): the height from which the slope is counted
     - `failed_fuel_share`: the share of `fuel_price` that flights with a failure pay
-    - `wind` (m/s^2): the amplitude of `sway`, in flights with a failure
+    - `wind` (m/s^2): the amplitude of `sway`
 
     `final_info`: `episodic_return` (with the prices and scales of `rewards.py`), `position_error` (m), `speed` (m/s),
     `slope`, `down`, `landed`, `fuel_kg` and `final_time` (s), (N,) each, `final_y` (N, 7) and `draw` (N, 13).
@@ -108,7 +108,7 @@ class LanderVectorEnv(BatchedEnv):
         self.position_scale, self.speed_scale, self.sink_rate = POSITION_SCALE, SPEED_SCALE, 0.0
         self.fuel_price, self.aloft_price, self.slope_price = FUEL_PRICE, ALOFT_PRICE, SLOPE_PRICE
         self.slope_height, self.failed_fuel_share = SLOPE_HEIGHT, 1.0
-        self.failed_thrust_share, self.start_spread, self.wind = 1.0, 1.0, 0.0
+        self.thrust_share, self.start_spread, self.wind = 1.0, 1.0, 0.0
         self.draw = np.zeros((num_envs, len(DRAW)))
         self.flights = self._drawn(self.draw)
         self.r, self.v, self.mass = self.flights.r.copy(), self.flights.v.copy(), self.flights.mass.copy()
@@ -195,10 +195,6 @@ class LanderVectorEnv(BatchedEnv):
         has_struck = self._ticks * PERIOD >= self.flights.strike
         return np.where(has_struck, self.flights.failed, 1.0)
 
-    def fails(self) -> np.ndarray:
-        """The flights (N,) that have a failure or will have one, as a mask."""
-        return np.isfinite(self.flights.strike)
-
     def sway(self) -> np.ndarray:
         """The acceleration (3, N) of `wind` in m/s^2: a sine along x and one along y, with a period of 10 to 30 s.
 
@@ -208,7 +204,7 @@ class LanderVectorEnv(BatchedEnv):
         digits = self.draw * 1000 % 1
         turns = self.time / (10 + 20 * digits[:, 2])
         along_x, along_y = (np.sin(2 * np.pi * (turns + digits[:, axis])) for axis in (0, 1))
-        return self.wind * self.fails() * np.stack([along_x, along_y, np.zeros(self.num_envs)])
+        return self.wind * np.stack([along_x, along_y, np.zeros(self.num_envs)])
 
     def _observe(self):
         obs = np.empty((self.num_envs, self.single_observation_space.shape[0]))
@@ -225,13 +221,12 @@ class LanderVectorEnv(BatchedEnv):
     def _advance(self, actions):
         burnt = self.mass.copy()
         greatest = self.lander.greatest_thrust
-        share = np.where(self.fails(), self.failed_thrust_share, 1.0)
-        command = greatest * limited(actions.T, self.lander.least_thrust / greatest, share)
+        command = greatest * limited(actions.T, self.lander.least_thrust / greatest, self.thrust_share)
         self.u[:] = command.T
         for _ in range(self._hold):
             self._fly(command)
         self.t += 1
-        price = self.fuel_price * np.where(self.fails(), self.failed_fuel_share, 1.0)
+        price = self.fuel_price * np.where(np.isfinite(self.flights.strike), self.failed_fuel_share, 1.0)
         rewards = -price / 100 * (burnt - self.mass)
         if self._ended.any():
             end = np.where(self.down, slope_reward(self.slope(), self.slope_price), -self.aloft_price)
@@ -324,8 +319,8 @@ class LanderVectorEnv(BatchedEnv):
         return DescentSheet(self.lander, "Descent")
 
 
-def limited(vectors, least: float, greatest: float | np.ndarray):
-    """Vectors (3, n) with their norms clipped to these limits, one number or (n,). A zero vector points up.
+def limited(vectors, least: float, greatest: float):
+    """Vectors (3, n) with their norms clipped to these limits. A zero vector points up.
 
     Each vector is first divided by its largest component, so that no square overflows.
     """
@@ -361,9 +356,9 @@ class LanderEnv(SingleEnv):
     slope_price = of_batch("slope_price", "Weight of `slope_reward`.")
     slope_height = of_batch("slope_height", "Height (m) from which the slope is counted.")
     failed_fuel_share = of_batch("failed_fuel_share", "Share of `fuel_price` that flights with a failure pay.")
-    failed_thrust_share = of_batch("failed_thrust_share", "Share of the thrust that failed flights may ask for.")
+    thrust_share = of_batch("thrust_share", "Share of the greatest thrust that a command may ask for.")
     start_spread = of_batch("start_spread", "Factor on the width of the starts, along x and y.")
-    wind = of_batch("wind", "Amplitude (m/s^2) of an acceleration that comes and goes, in failed flights.")
+    wind = of_batch("wind", "Amplitude (m/s^2) of an acceleration along x and y that comes and goes.")
 
 
 def make_lander_vector(env_id: str, num_envs: int = 1, **options) -> LanderVectorEnv:
