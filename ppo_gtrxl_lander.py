@@ -143,7 +143,7 @@ OURS = {
     "target_kl": 0.03,
     "memory_noise": "0:0.01 1:0",
     "log_std": "0:-1 0.6:-2.5 1:-3.6",  # a policy that learned with less noise has less reserve
-    "fuel_weight": "0:4 0.2:4 0.4:15",
+    "fuel_weight": "0:4 0.2:4 0.4:12",
     "slope_weight": "0:0 0.5:0 0.7:2",  # only late, because few descents are steep while the noise is large
     "weight_average": 0.998,
     "decision_s": 0.4,
@@ -153,7 +153,7 @@ MARS = {
     **OURS,
     # the first five prepare the policy for failures that are worse than those of the training
     "failure_emphasis": 1.2,  # six flights in ten fail
-    "failed_fuel_share": 0.25,  # they need a reserve of propellant, healthy flights need none
+    "failed_fuel_share": 0.3,  # they need a reserve of propellant, healthy flights need none
     "thrust_share": 0.8,  # the rest of the thrust is a reserve
     "start_spread": 1.5,  # less thrust sideways is as if the pad were farther and the start faster
     "wind": 0.7,  # a policy has to notice that its motion answers less than it expects
