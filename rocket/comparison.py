@@ -53,10 +53,11 @@ KNOWLEDGE = {  # what each opponent has to know
     "tvlqr_energy": "optimum and its gains once",
     "replan": "nominal model + IPOPT on board",
     "replan_measured": "nominal exhaust velocity + IPOPT on board",
+    "replan_after_lqr": "nominal exhaust velocity, optimum and its gains + IPOPT on board",
     "replan_hint": "its own exhaust velocity, drawn + IPOPT on board",
     "optimum": "the draw itself",
 }
-REPLANS = ("replan", "replan_measured", "replan_hint")
+REPLANS = ("replan", "replan_measured", "replan_after_lqr", "replan_hint")
 # with navigation noise these laws also fly by the estimates of a Kalman filter
 FILTERED = {f"{name}_filtered": name for name in ("tvlqr_energy", "replan", "replan_measured")}
 SOLVING = (*REPLANS, "replan_filtered", "replan_measured_filtered", "optimum")  # these fly only the first flights
@@ -147,16 +148,17 @@ class Comparison:
         self.fly("replay", guidance.open_loop(env_id), self.n)
         self.fly("tvlqr", guidance.tvlqr(env_id), self.n)
         self.fly("tvlqr_energy", guidance.tvlqr(env_id, by_energy=True), self.n)
-        z = draws(self.rocket, self.dispersion, self.eval_seed, self.solved)
-        drawn = guidance.drawn_exhaust(self.rocket, self.dispersion, z)
-        exhausts = dict(zip(REPLANS, (None, guidance.nominal_exhaust(self.rocket), drawn)))
-        for name, exhaust in exhausts.items():
-            if name != "replan_hint" or not self.failures:  # a hint of the draw says nothing of a failure
-                self.replan(name, exhaust)
+        nominal = guidance.nominal_exhaust(self.rocket)
+        self.replan("replan", None)
+        self.replan("replan_measured", nominal)
+        self.replan("replan_after_lqr", nominal, guidance.tvlqr(env_id, by_energy=True))
+        if not self.failures:  # the hint says nothing of them
+            drawn = guidance.drawn_exhaust(self.rocket, self.dispersion, self.draws(self.solved))
+            self.replan("replan_hint", drawn)
         if self.noise:
             self.fly("tvlqr_energy_filtered", self.behind_filter(guidance.tvlqr(env_id, by_energy=True)), self.n)
             self.replan("replan_filtered", None)
-            self.replan("replan_measured_filtered", exhausts["replan_measured"])
+            self.replan("replan_measured_filtered", nominal)
         if self.failures:
             self.optima = failing_optima(env_id, ROCKETS[env_id], self.failing, self.draws(self.solved), PROCESSES)
         else:
@@ -187,10 +189,10 @@ class Comparison:
         assert self.noise is not None
         return Filtered(law, self.env_id, self.noise, self.dispersion)
 
-    def replan(self, name: str, exhaust):
+    def replan(self, name: str, exhaust, before=None):
         """Fly `Replanning` on the first flights, and note the number and time of its solves."""
         velocity_noise = self.noise[1] if self.noise else 0.0
-        with guidance.Replanning(self.env_id, PROCESSES, exhaust, velocity_noise) as replanning:
+        with guidance.Replanning(self.env_id, PROCESSES, exhaust, velocity_noise, before) as replanning:
             law = self.behind_filter(replanning) if name in FILTERED else replanning
             self.fly(name, law, self.solved)
         self.about[name] |= {"solves": len(replanning.seconds), "solves_failed": replanning.failed}

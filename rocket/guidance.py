@@ -463,6 +463,8 @@ class Replanning:
     is replanned at once. Navigation noise of `velocity_noise` (m/s) disturbs the measured flow. A difference that this
     noise makes once in a billion steps counts as no failure.
 
+    With a law `before`, that law flies until the first plan instead of the open loop.
+
     `processes` share the solves, which changes only the time. `failed` counts the solves without a plan. `seconds` has
     one number for each solve.
 
@@ -475,8 +477,9 @@ class Replanning:
                          4 s,       10 s                       0.00002
     """
 
-    def __init__(self, env_id: str, processes: int = 1, exhaust=None, velocity_noise: float = 0.0):
+    def __init__(self, env_id: str, processes: int = 1, exhaust=None, velocity_noise: float = 0.0, before=None):
         self.velocity_noise = velocity_noise
+        self.before = before
         self.rocket = ROCKETS[env_id].rocket
         self.guess = optimum_guess(env_id)
         self.open_loop = open_loop(env_id)
@@ -502,8 +505,10 @@ class Replanning:
             if self.exhaust is not None:
                 self.engine = MeasuredEngine(self.rocket, self.exhaust, len(obs))
             self.planned_flow = self.engine.flow.copy()
+            self.is_planned = np.full(len(obs), self.before is None)
+            self.flown = self._planned(0)
         is_lit = obs[:, 8] >= min(len(self.rocket.burns) - 1, 1)  # the last burn
-        self.engine.update(obs, self._planned(max(t - 1, 0)), is_lit)
+        self.engine.update(obs, self.flown, is_lit)
         left = self.ends - self.rocket.dt * t  # s, of the plans
         is_time = t % round(REPLAN_EVERY / self.rocket.dt) == 0
         gain = self.planned_flow / self.engine.mass * nominal_exhaust(self.rocket) * self.rocket.dt  # m/s in a step
@@ -511,7 +516,10 @@ class Replanning:
         has_changed = np.abs(self.engine.flow / self.planned_flow - 1) > CHANGE + by_noise
         is_due = (is_time & (left > LAST_REPLAN)) | (has_changed & (left > SHORTEST))
         self._replan(obs, t, np.flatnonzero(is_lit & is_due))
-        return self._planned(t)
+        self.flown = self._planned(t)
+        if self.before is not None:
+            self.flown = np.where(self.is_planned[:, None], self.flown, self.before(obs, t))
+        return self.flown
 
     def _planned(self, t):
         """The directions (m, 3) of step t."""
@@ -527,7 +535,7 @@ class Replanning:
             if plan is None:
                 self.failed += 1
                 continue
-            self.plans[k], self.ends[k] = plan, plan["t"][-1]
+            self.plans[k], self.ends[k], self.is_planned[k] = plan, plan["t"][-1], True
             self.u[k, t:] = directions_at(plan, self.middles[t:])
 
     def _remaining_ascent(self, obs, now: float, k: int) -> RemainingAscent:

@@ -255,6 +255,20 @@ def test_a_loss_of_thrust_is_measured(step):
     assert misses[0] < 5e-6 < 5e-5 < misses[1]
 
 
+def test_after_the_lqr_an_early_loss_costs_less(monkeypatch):
+    """Stage 1 loses an eighth after a fifth of its burn. The LQR answers at once, the open loop not at all."""
+    monkeypatch.setattr(guidance, "REPLAN_EVERY", 100.0)
+    z, exhaust = np.zeros((1, SCORES + 4)), guidance.nominal_exhaust(ROCKET)
+    z[0, SCORES:] = 0.1, 0.6, 0.2, 0.5
+    masses = []
+    for before in (None, guidance.tvlqr(CUTOFF, by_energy=True)):
+        law = guidance.Replanning(CUTOFF, exhaust=exhaust, before=before)
+        end = fly_dispersed(CUTOFF, law, z, 1.0, failure=0.25)
+        assert end["error_norm"][0] < 1e-5
+        masses.append(end["final_y"][0, 6])
+    assert masses[1] > masses[0] + 20
+
+
 def test_a_failed_solve_keeps_the_last_plan(monkeypatch):
     def fail(*_):
         raise NoOptimum("none")
@@ -406,7 +420,7 @@ def test_report(compared):
     for name in comparison.REPLANS:
         assert laws[name]["solves"] == 9 and laws[name]["decision_us"] > 1000 > laws["replay"]["decision_us"] > 0
     lines = comparison.table(report).splitlines()
-    assert len(lines) == 2 + 9 + 5 + 2 + 3 and "replan_hint: 9 solves" in lines[-1]
+    assert len(lines) == 2 + 10 + 5 + 2 + 4 and "replan_hint: 9 solves" in lines[-1]
     (line,) = [line for line in lines if line.startswith("  tvlqr  ")]
     assert f"{laws['tvlqr']['dispersed_error_median']:.6f}" in line and f"{share.mean():.3%}" in line
     assert (folder / "figures" / "opponents.png").stat().st_size > 10_000
