@@ -17,7 +17,7 @@ from drawing.style import BOUNDARY, OPTIMUM, POLICY, TARGET
 from landing.lander import Lander
 from landing.rewards import POSITION_LIMIT, SPEED_LIMIT
 
-PATHS = 30  # flights of which the path is shown
+PATHS = 15  # flights of which the path is shown
 THRUSTS = 3  # flights of which the thrust is shown, too
 HEALTHY, FAILED = POLICY["color"], "tab:purple"
 STRIKE = {"color": "k", "linewidth": 1.0, "linestyle": "--"}

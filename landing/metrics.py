@@ -19,7 +19,7 @@ from landing.rewards import POSITION_LIMIT, SPEED_LIMIT
 FLIGHTS = 10_000  # the published code's number
 REFERENCE_STARTS = 200
 AT_ONCE = 1000  # flights of a batch, so that the caches of a policy stay below 0.2 GB
-KEPT_FLIGHTS = 30  # flights whose states eval.npz keeps
+KEPT_FLIGHTS = 15  # flights whose states eval.npz keeps
 
 
 def draws(eval_seed: int, n: int) -> np.ndarray:

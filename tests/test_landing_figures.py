@@ -62,7 +62,7 @@ def test_paths_are_those_of_the_flights(arrays):
     assert 5 < len(failed) < 25
     for axis, ax in enumerate(figure.axes[:2]):
         drawn = [line for line in ax.lines if line.get_color() in (figures.HEALTHY, figures.FAILED)]
-        assert len(drawn) == FLIGHTS
+        assert len(drawn) == figures.PATHS == FLIGHTS / 2
         for row, line in enumerate(drawn):
             assert np.array_equal(line.get_xydata(), arrays["y"][row][:, [axis, 2]], equal_nan=True)
             assert (line.get_color() == figures.FAILED) == (row in failed)
@@ -71,7 +71,7 @@ def test_paths_are_those_of_the_flights(arrays):
         assert 1 <= len(best) <= 3
         assert all(any(np.array_equal(one, other) for other in known) for one in best)
         assert [0, 0] in [line.get_xydata()[0].tolist() for line in ax.lines if line.get_marker() == "^"], "the pad"
-    assert "a title" in figure.get_suptitle() and f"{FLIGHTS} flights" in figure.get_suptitle()
+    assert "a title" in figure.get_suptitle() and f"{figures.PATHS} flights" in figure.get_suptitle()
     assert all(ax.get_xlabel() for ax in figure.axes) and figure.axes[0].get_ylabel() == "altitude (m)"
 
 

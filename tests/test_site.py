@@ -9,6 +9,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 sys.path.append(str(ROOT / "docs"))
+import failure_tables  # noqa: E402
 import script_pages  # noqa: E402
 
 CONFIG = ROOT / "docs" / "mkdocs.yml"
@@ -78,3 +79,13 @@ def test_the_table_of_a_script_is_that_of_the_results(name):
 
 def test_a_row_has_the_median_and_the_range():
     assert script_pages.span([3.0, 1.0, 2.0], 1) == "2.0 (1.0 to 3.0)" and script_pages.span([1.0, 1.0], 0) == "1"
+
+
+def test_the_tables_of_failures_are_those_of_the_comparisons():
+    """`python docs/failure_tables.py` would write nothing new. Another row would be seen, a missing table, too."""
+    text = failure_tables.PAGE.read_text()
+    assert failure_tables.with_tables(text) == text
+    changed = re.sub(r"^\| our policy, trained for failures \| .*%.*$", "| nothing |", text, flags=re.MULTILINE)
+    assert changed.count("| nothing |") >= 2 and failure_tables.with_tables(changed) == text
+    with pytest.raises(ValueError, match="short .kg., last ignition"):
+        failure_tables.with_tables(text.replace("| short (kg), last ignition |", "| short |"))
