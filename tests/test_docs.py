@@ -208,7 +208,7 @@ def rows_below(page, heading):
 def test_the_opponents_are_those_of_the_results():
     laws = json.loads((ROOT / "results" / "rocket_dispersed" / "opponents.json").read_text())["laws"]
     names = ["policy", "nominal flight only", "replay", "tvlqr", "tvlqr_energy", "replan", "replan_measured"]
-    names += ["replan_hint", "optimum"]
+    names += ["replan_after_lqr", "replan_hint", "optimum"]
     for name, (_, _, errors, perigee, box, *_) in zip(
         names, rows_below("docs/rocket.md", "| law | what it has to know |"), strict=True
     ):
