@@ -262,6 +262,8 @@ def take_checkpoint_args(args, kind, typed, env_options, buffers):
         if name == "env_id" and buffers.get(value) == buffers.get(given):
             print(f"--checkpoint is of {value}; it goes on with {given}")
             decided[name] = given
+        elif name == "env_id":
+            refuse(name, given, f"the checkpoint has {value} and flies nothing else")
         else:
             refuse(name, given, f"the checkpoint has {value}; leave the flag out")
     decided |= {name: getattr(args, name) for name in MAY_DIFFER_FROM_A_CHECKPOINT & typed}

@@ -6,6 +6,7 @@ replay by the environment, the references of many draws. CasADi is imported only
 
 from __future__ import annotations
 
+import sys
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -442,6 +443,8 @@ def kept_references(lander: Lander, rows: bytes, failure: tuple, processes: int)
     drawn = flights(lander, draw, *failure)
     _, first, of_draw = np.unique(np.vstack(drawn), axis=1, return_index=True, return_inverse=True)
     jobs = [(lander, Flights(*(array[..., [k]] for array in drawn)), 0) for k in first]
+    if len(jobs) > 1:
+        print(f"solving the optima of {len(jobs)} landings, once", file=sys.stderr, flush=True)
     found = solutions(jobs, processes)
     optima = [found[k] for k in of_draw.ravel()]
     solved = [optimum for optimum in optima if isinstance(optimum, dict)]

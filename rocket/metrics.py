@@ -104,7 +104,7 @@ def wrapped(key: str, difference: float) -> float:
 # Carlo analyses by order statistics have this size (Hanson and Beard, 2012).
 DISPERSED_STARTS = 1705
 AT_ONCE = 341  # flights of a batch, a fifth of all, so that the caches of a policy stay below 0.3 GB
-# 3 sigma accuracy of insertion into a transfer orbit by the Falcon 9 user's guide, quoted from memory
+# 3 sigma accuracy of insertion into a transfer orbit by the Falcon 9 user's guide, quoted from memory and not looked up
 BOX = {"perigee_km": 10.0, "apogee_km": 500.0, "i_deg": 0.1, "raan_deg": 0.1, "argp_deg": 0.3}
 
 
