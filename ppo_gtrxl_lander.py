@@ -143,7 +143,7 @@ OURS = {
     "target_kl": 0.03,
     "memory_noise": "0:0.01 1:0",
     "log_std": "0:-1 0.6:-2.5 1:-3.6",  # a policy that learned with less noise has less reserve
-    "fuel_weight": "0:4 0.12:4 0.25:12",  # dear early, because large noise settles how much a policy burns
+    "fuel_weight": "0:4 0.2:4 0.4:12",
     "slope_weight": "0:0 0.5:0 0.7:2",  # only late, because few descents are steep while the noise is large
     "weight_average": 0.998,
     "decision_s": 0.4,
