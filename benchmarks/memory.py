@@ -173,6 +173,7 @@ EXPERIMENTS = {
         "Dispersed rocket, cut-off: ||error|| over 1705 flights",
         rocket_rows("rocket_dispersed"),
         DISPERSED,
+        drawn=False,  # its rows have an older input than L_mem 32
     ),
     "failures": Experiment(
         "Dispersed rocket with a loss of thrust at a random moment: share of the savable flights that are saved",
