@@ -263,7 +263,7 @@ def take_checkpoint_args(args, kind, typed, env_options, buffers):
             print(f"--checkpoint is of {value}; it goes on with {given}")
             decided[name] = given
         elif name == "env_id":
-            refuse(name, given, f"the checkpoint has {value} and flies nothing else")
+            refuse(name, given, f"the checkpoint has {value}, whose policy does not fit")
         else:
             refuse(name, given, f"the checkpoint has {value}; leave the flag out")
     decided |= {name: getattr(args, name) for name in MAY_DIFFER_FROM_A_CHECKPOINT & typed}

@@ -86,6 +86,7 @@ def rocket_rows(result):
     }
 
 
+OLDER_INPUT = {"memory_0": "L_mem 0", "mlp": "MLP of about the same size", "oracle": "L_mem 32, draw seen"}
 DISPERSED = {
     "dispersed_error_median": "median",
     "dispersed_error_p95": "p95",
@@ -173,7 +174,18 @@ EXPERIMENTS = {
         "Dispersed rocket, cut-off: ||error|| over 1705 flights",
         rocket_rows("rocket_dispersed"),
         DISPERSED,
-        drawn=False,  # its rows have an older input than L_mem 32
+    ),
+    "nominal_older_input": Experiment(
+        "Rocket, cut-off, nominal flight, an older input",
+        OLDER_INPUT,
+        {"error_norm": "||error||", "perigee_km": "perigee (km)", "final_mass_kg": "mass (kg)"},
+        drawn=False,
+    ),
+    "rocket_older_input": Experiment(
+        "Dispersed rocket, cut-off, an older input: ||error|| over 1705 flights",
+        OLDER_INPUT,
+        DISPERSED,
+        drawn=False,
     ),
     "failures": Experiment(
         "Dispersed rocket with a loss of thrust at a random moment: share of the savable flights that are saved",

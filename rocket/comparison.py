@@ -461,8 +461,9 @@ def compare(
     """Compare a results folder's policy, and those of `also` (name, path), with all opponents. Print and write it.
 
     When all is flown, opponents.json and figures/opponents.png are written. With failures opponents.npz
-    (`flights_by_loss`) and figures/opponents_by_loss.png are written, too. With failures at the ignition all begin with
-    opponents_at_ignition, so that both comparisons have room in one folder. Raises OSError or ValueError for bad input.
+    (`flights_by_loss`) and figures/opponents_by_loss.png are written, too. With failures at the ignition the names
+    begin with opponents_at_ignition, so that both comparisons have room in one folder. Only opponents.png keeps its
+    name: it shows the healthy flights, which are the same. Raises OSError or ValueError for bad input.
     """
     check_failure(failure, failure_time, ROCKETS[env_id].cutoff)
     noise = checked_noise(navigation_noise)
@@ -488,7 +489,7 @@ def compare(
 
     title = f"{env_id} at dispersion {dispersion:g}{noise_words(report).rstrip(',')}"
     stem = "opponents_at_ignition" if failure and failure_time == "ignition" else "opponents"
-    figures = {f"{stem}.png": dispersed_figure(comparison.rocket, labelled, title)}
+    figures = {"opponents.png": dispersed_figure(comparison.rocket, labelled, title)}
     if failure:
         figures[f"{stem}_by_loss.png"] = losses_figure(report["by_loss"], f"{title}, {WHEN[failure_time]}")
         arrays = {key: values.astype(np.float32) for key, values in comparison.flights_by_loss().items()}
