@@ -2,7 +2,7 @@
 
     python ppo_gtrxl_lander.py --seed 1                                # our recipe
     python ppo_gtrxl_lander.py --seed 1 --failure-time random          # the failure strikes within the first 40 s
-    python ppo_gtrxl_lander.py --seed 1 --env-id PoweredDescent-v0     # nothing is hidden
+    python ppo_gtrxl_lander.py --seed 1 --failure-probability 0        # nothing is hidden
     python ppo_gtrxl_lander.py --eval-only --checkpoint runs/<run>/agent.safetensors
 
 Reading order: arguments, recipes, problem, Gated Transformer-XL, agent, PPO, what we add to PPO, training, main.
@@ -74,11 +74,11 @@ class Args:
     observe_velocity: bool = True  # show the velocity to the policy
     observe_command: bool = True  # show the last command to the policy
     observe_draw: bool = False  # show mass, gravity and failure to the policy, which no real flight could know
-    failure_probability: float = 0.5  # probability of a hidden failure
-    failure_size: float = 2.5  # a failure divides the thrust along one lateral axis by this, in evaluations
+    failure_probability: float | None = None  # probability of a hidden failure (none: the lander's)
+    failure_size: float | None = None  # what it divides the thrust along one lateral axis by (none: the lander's)
     failure_time: str = "start"  # when a failure strikes: at the "start" or at a "random" moment of the first 40 s
     decision_s: float = 0.2  # seconds between two commands of the policy, a multiple of 0.2
-    longest_flight: float = 100.0  # seconds in which a flight has to land
+    longest_flight: float | None = None  # seconds in which a flight has to land (none: the lander's)
 
     # Table 1, the column of the rocket
     num_blocks: int = 6  # number of GTrXL blocks (0: a plain MLP, without memory)
@@ -111,7 +111,7 @@ class Args:
     flights_per_start: Schedule = 1  # flights of each draw, compared with one another
     fuel_weight: Schedule = 1.0  # reward lost for 100 kg of propellant in training
     slope_weight: Schedule = 2.0  # weight of a flat last descent in training (`slope_reward` of landing/rewards.py)
-    training_failure_size: float = 2.0  # --failure-size in training, as published
+    training_failure_size: float | None = None  # --failure-size in training (none: the same)
     failure_emphasis: float = 1.0  # factor on --failure-probability in training
     failed_fuel_share: float = 1.0  # share of --fuel-weight that flights with a failure pay
     thrust_share: float = 1.0  # share of the greatest thrust that training may ask for
@@ -151,7 +151,8 @@ OURS = {
 }
 MARS = {
     **OURS,
-    # the first five prepare the policy for failures that are worse than those of the training
+    "training_failure_size": 2.0,  # as published; 2.5 in evaluations
+    # the next five prepare the policy for failures that are worse than those of the training
     "failure_emphasis": 1.2,  # six flights in ten fail
     "failed_fuel_share": 0.3,  # they need a reserve of propellant, healthy flights need none
     "thrust_share": 0.8,  # the rest of the thrust is a reserve
@@ -159,21 +160,12 @@ MARS = {
     "wind": 0.7,  # a policy has to notice that its motion answers less than it expects
     "longest_flight": 60.0,  # flights of learned policies take 45 s
 }
-ONE_START = {  # all flights of an update are compared
-    **OURS,
-    "total_updates": 500,
-    "num_envs": 64,
-    "num_minibatches": 8,
-    "flights_per_start": 64,
-    "failure_probability": 0.0,
-}
-RECIPES = {"MarsLanding-v0": MARS, "PoweredDescent-v0": ONE_START}
+RECIPES = {"MarsLanding-v0": MARS}
 
 
 def recipe(args):
-    """What our recipe changes for the environments of `args`. A lander of your own takes ONE_START or OURS."""
-    own = ONE_START if LANDERS[args.env_id].has_one_flight else OURS
-    return RECIPES.get(args.env_id, own)
+    """What our recipe changes for the environments of `args`. A lander of your own takes OURS."""
+    return RECIPES.get(args.env_id, OURS)
 
 
 # Problem: input and action (features and first action are ours) -------------------------------------------------------
@@ -251,8 +243,11 @@ def set_curriculum(envs, args, progress):
     envs.aloft_price = ALOFT_PRICE
     envs.slope_height = SLOPE_HEIGHT
     envs.sink_rate = SINK_RATE
-    envs.failure_probability = min(args.failure_emphasis * args.failure_probability, 1.0)
-    envs.failure_size = args.training_failure_size
+    of_lander = LANDERS[args.env_id].failure_probability
+    probability = of_lander if args.failure_probability is None else args.failure_probability
+    envs.failure_probability = min(args.failure_emphasis * probability, 1.0)
+    if args.training_failure_size is not None:
+        envs.failure_size = args.training_failure_size
     envs.thrust_share = args.thrust_share
     envs.start_spread = args.start_spread
     envs.wind = value_at(args.wind, progress)

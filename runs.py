@@ -237,7 +237,8 @@ def read_policy(path, kind, env_options, buffers):
     """
     options = [name for name in env_options if name not in NOT_OF_A_CHECKPOINT]
     names = ("env_id", *options, *NETWORK)
-    kinds = {name: type(getattr(kind, name)) for name in names}
+    hints = get_type_hints(kind)
+    kinds = {name: hints[name] for name in names}
     younger = {name: getattr(kind, name) for name in options}  # options that an older file does not have
     saved = read_checkpoint(path, kinds, tuple(buffers), younger)
     return saved, {name: saved["args"][name] for name in names}

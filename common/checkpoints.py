@@ -8,7 +8,10 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping
 from pathlib import Path
+from types import UnionType
+from typing import get_args
 
 import numpy as np
 import safetensors
@@ -22,7 +25,11 @@ COUNTERS = {"seed": int, "total_updates": int, "global_step": int, "training_sec
 
 
 def read_checkpoint(
-    path, expected: dict[str, type], env_ids=(), defaults: dict | None = None, flag: str = "--checkpoint "
+    path,
+    expected: Mapping[str, type | UnionType],
+    env_ids=(),
+    defaults: dict | None = None,
+    flag: str = "--checkpoint ",
 ) -> dict:
     """An agent.safetensors: `args` (the run's arguments), `progress` (its counters), `tensors` (NumPy arrays).
 
@@ -42,7 +49,8 @@ def read_checkpoint(
         # this check comes first, because another script's file has other arguments, too
         if env_ids and isinstance(env_id, str) and env_id not in env_ids:
             raise BadInput(f"{flag}{path}: is of {env_id}; this script takes {', '.join(env_ids)}")
-        wrong = [name for name, kind in expected.items() if type(args[name]) is not kind]
+        allowed = {name: types_of(kind) for name, kind in expected.items()}
+        wrong = [name for name, kinds in allowed.items() if type(args[name]) not in kinds]
         metadata.setdefault("training_seconds", metadata["wall_seconds"])  # an older file has only this time
         progress = {name: kind(metadata[name]) for name, kind in COUNTERS.items()}
         if not all(math.isfinite(value) and value >= 0 for value in progress.values()):
@@ -55,10 +63,16 @@ def read_checkpoint(
         raise BadInput(f"{flag}{path}: damaged or foreign ({error}); it must be an agent.safetensors") from error
     if wrong:
         name = wrong[0]
-        raise BadInput(f"{flag}{path}: its {name} is {args[name]!r}; must be {expected[name].__name__}")
+        kinds = " or ".join(kind.__name__ for kind in allowed[name])
+        raise BadInput(f"{flag}{path}: its {name} is {args[name]!r}; must be {kinds}")
     if not all(np.isfinite(tensor).all() for tensor in tensors.values()):
         raise BadInput(f"{flag}{path}: holds a NaN or an infinity; its weights must be finite")
     return {"args": args, "progress": progress, "tensors": tensors}
+
+
+def types_of(kind: type | UnionType) -> tuple[type, ...]:
+    """The types of which an annotation such as `float | None` consists."""
+    return get_args(kind) if isinstance(kind, UnionType) else (kind,)
 
 
 def read_metadata(data: bytes) -> dict[str, str]:

@@ -1,5 +1,6 @@
 """What is asked of a lander's id: metrics by hand, the optimum beside a policy, the script from training to files."""
 
+import dataclasses
 import importlib
 import json
 
@@ -11,7 +12,8 @@ import envs
 import evaluate
 from common.evaluations import read_evaluation
 from common.tasks import task_of
-from landing.environment import fly_lander
+from landing.environment import LanderVectorEnv, fly_lander
+from landing.lander import LANDERS
 from landing.metrics import KEPT_FLIGHTS, draws, flight_metrics, fly_draws
 from landing.task import held
 
@@ -125,15 +127,24 @@ def test_failed_flights_may_pay_a_share_of_the_propellant():
     assert rewards[1] == pytest.approx(rewards[0] * [1.0, 0.5], rel=1e-12)
 
 
-def test_training_meets_failures_of_another_size():
+def test_training_on_mars_meets_failures_of_another_size():
     """As published: of size 2 in training, of 2.5 in evaluations. Ours: more often, except where none are asked for."""
-    args = script.Args(**script.OURS)
+    args = script.Args(**script.MARS)
     batch = gym.make_vec(ID, num_envs=args.num_envs)
     script.set_curriculum(batch, args, 0.0)
     batch.reset(seed=0)
     assert batch.flights.failed.min() == 0.5
     assert gym.make_vec(ID, num_envs=1).failure_size == 2.5
-    for asked, trained in ((0.5, 0.6), (0.0, 0.0), (1.0, 1.0)):
+    for asked, trained in ((None, 0.6), (0.5, 0.6), (0.0, 0.0), (1.0, 1.0)):
         args = script.Args(**script.MARS, failure_probability=asked)
         script.set_curriculum(batch, args, 0.0)
         assert batch.failure_probability == trained
+
+
+def test_a_lander_of_your_own_trains_with_the_failures_of_its_table(monkeypatch):
+    own = dataclasses.replace(LANDERS[ID], failure_probability=0.3, failure_size=1.5, longest=80.0)
+    monkeypatch.setitem(LANDERS, "Own-v0", own)
+    args = script.Args(env_id="Own-v0", **script.recipe(script.Args(env_id="Own-v0")))
+    batch = LanderVectorEnv(own, num_envs=8, **{name: getattr(args, name) for name in script.ENV_OPTIONS})
+    script.set_curriculum(batch, args, 0.5)
+    assert (batch.failure_probability, batch.failure_size, batch.longest_flight) == (0.3, 1.5, 80.0)
