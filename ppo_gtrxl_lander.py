@@ -75,7 +75,7 @@ class Args:
     observe_command: bool = True  # show the last command to the policy
     observe_draw: bool = False  # show mass, gravity and failure to the policy, which no real flight could know
     failure_probability: float | None = None  # probability of a hidden failure (none: the lander's)
-    failure_size: float | None = None  # what it divides the thrust along one lateral axis by (none: the lander's)
+    failure_size: float | None = None  # a failure divides the thrust along one axis by this (none: the lander's)
     failure_time: str = "start"  # when a failure strikes: at the "start" or at a "random" moment of the first 40 s
     decision_s: float = 0.2  # seconds between two commands of the policy, a multiple of 0.2
     longest_flight: float | None = None  # seconds in which a flight has to land (none: the lander's)
