@@ -162,10 +162,9 @@ EXPERIMENTS = {
         DISPERSED,
     ),
     "failures": Experiment(
-        "Dispersed rocket with a loss of thrust at a random moment: share of the savable flights that are saved",
+        "Dispersed rocket, loss of thrust at a random moment: share of the savable flights that are saved",
         rocket_rows("rocket_failures"),
         FAILED,
-        drawn=False,
     ),
     "navigation": Experiment(
         "Dispersed rocket, position and velocity seen with noise of 10 m and 0.1 m/s: ||error|| over 1705 flights",
