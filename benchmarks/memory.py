@@ -177,6 +177,12 @@ EXPERIMENTS = {
         {**lengths(0, 1, 8, 32), "mlp": "MLP of about the same size"},
         LANDED,
     ),
+    "lander_recipe": Experiment(
+        "Landing, the whole training of results/mars_landing, failure from the start",
+        {"memory_0": "L_mem 0", "../../mars_landing": "L_mem 8", "mlp": "MLP of about the same size"},
+        LANDED,
+        drawn=False,
+    ),
     "lander_conditions": Experiment(
         "Landing, one condition changed",
         {
