@@ -1,8 +1,8 @@
 """What the memory is for: the table and the figure of results/memory, from the evaluations of its runs.
 
     python benchmarks/run_seeds.py benchmarks/memory_di_jobs.txt --at-once 2 --numbers      # trains what is missing
-    python benchmarks/run_seeds.py benchmarks/memory_nominal_jobs.txt --at-once 2           # the same: hours
-    python benchmarks/run_seeds.py benchmarks/memory_rocket_jobs.txt --at-once 2 --numbers  # the same: hours
+    python benchmarks/run_seeds.py benchmarks/memory_nominal_jobs.txt --at-once 2           # the same: an hour
+    python benchmarks/run_seeds.py benchmarks/memory_rocket_jobs.txt --at-once 2            # the same: an hour
     python benchmarks/run_seeds.py benchmarks/memory_failures_jobs.txt --at-once 2 --numbers  # the same: an hour
     python benchmarks/run_seeds.py benchmarks/memory_navigation_jobs.txt --at-once 2 --numbers  # the same: an hour
     python benchmarks/run_seeds.py benchmarks/memory_lander_jobs.txt --at-once 2 --numbers  # the same: hours
