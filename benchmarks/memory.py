@@ -236,7 +236,7 @@ def table(experiment, found, by_seed=False):
             lines.append([experiment.rows[row], label, *cells])
     if experiment.bound:
         bound = experiment.bound()
-        lines.append(["no memory can beat", "", *(digits(bound.get(key)) for key in experiment.keys)])
+        lines.append(["limit for any memory", "", *(digits(bound.get(key)) for key in experiment.keys)])
     widths = [max(map(len, column)) for column in zip(*lines)]
     printed = ["  ".join(word.ljust(width) for word, width in zip(line, widths)).rstrip() for line in lines]
     return [experiment.title, *(f"  {line}" for line in printed)]
@@ -259,7 +259,7 @@ def memory_figure(results):
                 experiment.bound()[key],
                 color="0.5",
                 linestyle="--",
-                label=f"no memory can beat {digits(experiment.bound()[key])}",
+                label=f"limit for any memory {digits(experiment.bound()[key])}",
             )
             ax.legend()
         ax.set_xticks(range(len(found)), [experiment.rows[row] for row in found], rotation=30, ha="right")
