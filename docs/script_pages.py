@@ -1,4 +1,4 @@
-"""Write the tables of results into the pages of docs/scripts/.
+"""Write the tables of results into the pages of docs/scripts/, and that of the held-out runs into docs/results.md.
 
 python docs/script_pages.py
 """
@@ -25,13 +25,48 @@ ROWS = {  # page: result folder -> its name
     },
     "ppo_gtrxl_lander": {"mars_landing": "Mars landing"},
 }
+HELD_OUT = {  # result folder -> its name in docs/results.md
+    "di": "Double integrator",
+    "vdp": "Van der Pol",
+    "di_waypoints": "Double integrator, 2 waypoints",
+    "vdp_waypoints": "Van der Pol, 3 waypoints",
+    "rocket_fixed": "Rocket, 961 s",
+    "rocket_cutoff": "Rocket with cut-off",
+    "rocket_dispersed": "The same, every flight another vehicle",
+    "rocket_failures": "The same, an engine may lose thrust",
+    "two_stage_leo": "Two stages",
+    "mars_landing": "Landing on Mars",
+}
 TABLE = re.compile(r"(\| result \| .*\n\|[-|]+\|\n)(?:\|.*\n)*")  # head, then rows
+FIGURES = (  # the numbers of a held-out row: those of the first line whose keys a result has
+    {"ratio_of_sums": ("cost / optimum's", 1, 4, ""), "hit_rate": ("every circle hit", 100, 1, " %")},
+    {
+        "landed_rate": ("landed", 100, 2, " %"),
+        "position_error_mean_m": ("distance to the pad", 1, 2, " m"),
+        "fuel_ratio": ("propellant / optimum's", 1, 3, ""),
+    },
+    {
+        "failure_saved_rate": ("saved", 100, 1, " %"),
+        "failure_error_median": ("‖error‖, median", 1, 5, ""),
+        "failure_mass_short_mean_kg": ("short of the optimum", 1, 1, " kg"),
+    },
+    {"dispersed_error_median": ("‖error‖, median", 1, 5, ""), "dispersed_box_rate": ("in the box", 100, 1, " %")},
+    {"error_norm": ("‖error‖", 1, 6, ""), "mass_ratio_reached": ("mass / optimum's", 100, 3, " %")},
+    {"error_norm": ("‖error‖", 1, 6, "")},
+)
+
+
+def found_by_seeds(result):
+    """{key: (seeds,)} of what every seed of a result has found."""
+    paths = sorted((RESULTS / result / "seeds").glob("*.json"), key=lambda path: int(path.stem))
+    seeds = [json.loads(path.read_text()) for path in paths]
+    return {key: np.array([seed[key] for seed in seeds]) for key in seeds[0] if all(key in seed for seed in seeds)}
 
 
 def row(result, name):
     """A result's row: the median over its seeds, and the range of all."""
-    seeds = [json.loads(path.read_text()) for path in sorted((RESULTS / result / "seeds").glob("*.json"))]
-    found = {key: np.array([seed[key] for seed in seeds]) for key in seeds[0] if all(key in seed for seed in seeds)}
+    found = found_by_seeds(result)
+    seeds = found["seed"]
     if "ratio_of_sums" in found:
         cells = [span(found["ratio_of_sums"], 4), span(100 * found["hit_rate"], 1) + " %"]
     elif "landed_rate" in found:
@@ -51,6 +86,25 @@ def span(values, digits):
     return middle if low == high else f"{middle} ({low} to {high})"
 
 
+def held_out_rows(result, name):
+    """The rows of a result: a number's median and range over the reported seeds, and each held-out seed's."""
+    reported, held_out = found_by_seeds(result), found_by_seeds(f"held_out/{result}")
+    figures = next(figures for figures in FIGURES if figures.keys() <= reported.keys())
+    rows = []
+    for key, (label, factor, digits, unit) in figures.items():
+        each = ", ".join(f"{factor * value:.{digits}f}" for value in held_out[key])
+        rows.append(f"| {name} | {label} | {span(factor * reported[key], digits)}{unit} | {each}{unit} |\n")
+        name = ""
+    return "".join(rows)
+
+
+def with_held_out_rows(text):
+    """The text of docs/results.md with the rows of its table of held-out runs."""
+    there = {result: name for result, name in HELD_OUT.items() if (RESULTS / "held_out" / result).exists()}
+    rows = "".join(held_out_rows(result, name) for result, name in there.items())
+    return TABLE.sub(lambda found: found[1] + rows, text)
+
+
 def with_rows(text, name):
     """A page's text with the rows of its table."""
     rows = "".join(row(result, words) for result, words in ROWS[name].items())
@@ -58,6 +112,8 @@ def with_rows(text, name):
 
 
 if __name__ == "__main__":
+    page = HERE / "results.md"
+    page.write_text(with_held_out_rows(page.read_text()))
     for name in ROWS:
         path = PAGES / f"{name}.md"
         path.write_text(with_rows(path.read_text(), name))

@@ -489,7 +489,8 @@ def compare(
 
     title = f"{env_id} at dispersion {dispersion:g}{noise_words(report).rstrip(',')}"
     stem = "opponents_at_ignition" if failure and failure_time == "ignition" else "opponents"
-    figures = {"opponents.png": dispersed_figure(comparison.rocket, labelled, title)}
+    flown = f"{title}, healthy flights" if failure else title
+    figures = {"opponents.png": dispersed_figure(comparison.rocket, labelled, flown)}
     if failure:
         figures[f"{stem}_by_loss.png"] = losses_figure(report["by_loss"], f"{title}, {WHEN[failure_time]}")
         arrays = {key: values.astype(np.float32) for key, values in comparison.flights_by_loss().items()}
