@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import run_seeds
 
 ROOT = Path(__file__).parents[1]
 sys.path.append(str(ROOT / "docs"))
@@ -75,6 +76,18 @@ def test_the_table_of_a_script_is_that_of_the_results(name):
     assert script_pages.with_rows(text, name) == text
     assert all(f"results/{result}/README.md" in text for result in script_pages.ROWS[name])
     assert script_pages.with_rows(text.replace("(0.0000", "(0.1").replace("(1.00", "(1.1"), name) == text
+
+
+def test_the_table_of_held_out_runs_is_that_of_the_results():
+    """`python docs/script_pages.py` would write nothing new, and another table would be seen. Runs are those listed."""
+    text = (ROOT / "docs" / "results.md").read_text()
+    assert script_pages.with_held_out_rows(text) == text
+    assert script_pages.with_held_out_rows(text.replace("| 1.0002 (", "| 1.0003 (")) == text
+    jobs = run_seeds.read_jobs(ROOT / "benchmarks" / "held_out_jobs.txt")
+    for result in script_pages.HELD_OUT:
+        trained = {int(path.stem) for path in (ROOT / "results" / "held_out" / result).glob("seeds/*.json")}
+        assert trained <= {job.args["seed"] for job in jobs if job.results.name == result}
+        assert len(trained) in (0, 2)
 
 
 def test_a_row_has_the_median_and_the_range():
