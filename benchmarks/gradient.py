@@ -573,11 +573,11 @@ def ppo_runs(row: Row) -> list[dict]:
     if row.start:
         before = ROOT / "results" / ROWS[row.start].result
         shipped = read_json(before / "eval.json")
-        flights, seconds = ppo_flights(before, shipped), shipped["training_seconds"]
+        flights, seconds = ppo_flights(before, shipped), shipped["wall_seconds"]
     runs = []
     for path in sorted((folder / "seeds").glob("*.json")):
         run = read_json(path)
-        minutes = (seconds + run["training_seconds"]) / 60
+        minutes = (seconds + run["wall_seconds"]) / 60
         runs.append(run | {"flights": flights + ppo_flights(folder, run), "minutes": minutes})
     return runs
 

@@ -4,12 +4,12 @@
 
 A run averages its weights over the optimiser's steps (--weight-average), and evaluations fly this average. The run's
 training_state.pt holds the last weights, too. They are flown by the run's script, with the run's options of the
-environment and its evaluation seed. Prints both columns for each run, with the rows of `evaluate.py figures`.
+environment, evaluation seed and number of starts. Prints both columns for each run, with the rows of
+`evaluate.py figures`; "-" stands for a number that an evaluation does not have.
 """
 
 from __future__ import annotations
 
-import json
 import sys
 import tempfile
 from pathlib import Path
@@ -25,29 +25,47 @@ from common.evaluations import read_json  # noqa: E402
 from common.policies import evaluate_by_script, script_of  # noqa: E402
 from common.tasks import task_of  # noqa: E402
 
-OPTIONS = ("eval_seed", "dispersion", "failure", "failure_time")  # those that a file of weights does not decide
+NOT_OF_WEIGHTS = ("eval_seed", "eval_starts", *runs.NOT_OF_A_CHECKPOINT)  # what a file of weights does not decide
+
+
+def flags_of(args: dict) -> dict:
+    """{flag: value} of an evaluation like that of a run with these arguments."""
+    flags = {}
+    for name in NOT_OF_WEIGHTS:
+        value = args.get(name)
+        if value is not None:
+            is_several = isinstance(value, list | tuple)
+            flags[name.replace("_", "-")] = " ".join(map(str, value)) if is_several else value
+    return flags
 
 
 def last_weights_flown(run: Path) -> dict:
-    """The metrics of a run's last weights, on the flights of its eval.json. Raises BadInput if its script refuses."""
-    state = torch.load(run / "training_state.pt", map_location="cpu", weights_only=True)
-    flags = {name: value for name, value in state["args"].items() if name in OPTIONS and value is not None}
-    flags = {name.replace("_", "-"): value for name, value in flags.items()}
-    state["average"] = state["agent"]
+    """The metrics of a run's last weights. Raises BadInput that names the run if they cannot be flown."""
+    try:
+        state = torch.load(run / "training_state.pt", map_location="cpu", weights_only=True)
+        state["average"] = state["agent"]
+        flags = flags_of(state["args"])
+    except Exception as error:  # a missing or damaged file fails in many ways, which are all the same to the user
+        raise BadInput(f"{run} must hold a run's training_state.pt ({error})") from error
     with tempfile.TemporaryDirectory() as folder:
         runs.save_run(Path(folder), state)
         weights, found = Path(folder) / "agent.safetensors", Path(folder) / "eval.json"
-        evaluate_by_script(script_of(weights), weights, flags | {"eval-json": found})
-        return json.loads(found.read_text())
+        try:
+            evaluate_by_script(script_of(weights), weights, flags | {"eval-json": found})
+        except BadInput as error:
+            raise BadInput(f"the last weights of {run} do not fly: {error}") from error
+        return read_json(found)
 
 
 def table(run: Path) -> list[str]:
-    """The lines of a run: averaged weights beside the last ones."""
+    """The lines of a run: averaged weights beside the last ones. Raises BadInput or OSError that says what is wrong."""
     averaged, last = read_json(run / "eval.json"), last_weights_flown(run)
     lines = [f"{run}", f"  {'':38}{'averaged':>12}{'last':>12}"]
     for key, (label, form) in task_of(averaged["env_id"]).seed_rows().items():
-        if isinstance(averaged.get(key), int | float):
-            lines.append(f"  {label:38}{format(averaged[key], form):>12}{format(last[key], form):>12}")
+        both = [metrics.get(key) for metrics in (averaged, last)]
+        if any(value is not None for value in both):
+            cells = ["-" if value is None else format(value, form) for value in both]
+            lines.append(f"  {label:38}" + "".join(f"{cell:>12}" for cell in cells))
     return lines
 
 

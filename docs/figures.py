@@ -1,4 +1,4 @@
-"""Draw the README's two explanatory figures (after the paper's Figures 1 and 2) beside this script.
+"""Draw the network (README) and one policy for all phases (docs/rocket.md), after the paper's Figures 2 and 1.
 
     python docs/figures.py
 
