@@ -174,7 +174,11 @@ EXPERIMENTS = {
     ),
     "lander": Experiment(
         "Landing, failure at a random moment, the last command shown: share of the flights that landed",
-        {**lengths(0, 1, 8, 32), "mlp": "MLP of about the same size"},
+        {
+            **lengths(0, 1, 8, 32),
+            "mlp": "MLP of about the same size, width 192",
+            "no_blocks": "MLP, width 64: our network without its blocks",
+        },
         LANDED,
     ),
     "lander_recipe": Experiment(
