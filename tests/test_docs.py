@@ -133,7 +133,8 @@ def numbers_of(cell):
 
 def seeds_of(result):
     """What every seed's evaluation found: key -> a value a seed."""
-    seeds = [json.loads(path.read_text()) for path in (ROOT / "results" / result / "seeds").glob("*.json")]
+    paths = sorted((ROOT / "results" / result / "seeds").glob("*.json"), key=lambda path: int(path.stem))
+    seeds = [json.loads(path.read_text()) for path in paths]
     return {key: np.array([seed[key] for seed in seeds]) for key in set.intersection(*map(set, seeds))}
 
 
@@ -195,6 +196,11 @@ def test_the_front_page_says_what_the_results_hold(result):
         for (_, *span), (values, digits, _) in zip(numbers, figures):
             assert not any(span) or span == [f"{end:.{digits}f}" for end in (min(values), max(values))]
     assert any(numbers_of(row["here"])[0][1:]) == (count > 1)  # as the last line below the table says
+    held_out = "–"
+    if (ROOT / "results" / "held_out" / result).exists():
+        first_figure = measured(result, seeds_of(f"held_out/{result}"))[1][0]
+        held_out = ", ".join(f"{value:.{first_figure[1]}f}" for value in first_figure[0]) + first_figure[2]
+    assert row["held out"] == held_out
 
 
 def rows_below(page, heading):
