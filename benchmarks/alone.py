@@ -51,8 +51,13 @@ def curve_of(job, seconds: int) -> dict:
 
 
 def compare(name: str, job, seconds: int) -> str:
-    """A line: steps a second alone, of the shipped run, their ratio, and after how many updates."""
+    """A line: steps a second alone, of the shipped run, their ratio, and after how many updates.
+
+    Raises RuntimeError if the training makes no update in these seconds.
+    """
     curve = curve_of(job, seconds)
+    if SPS not in curve:
+        raise RuntimeError(f"{name} made no update in {seconds} s; give more --seconds")
     shipped = read_csv(ROOT / "results" / name / "seeds" / f"{job.args['seed']}.csv")
     steps, speeds = curve[SPS]
     updates = len(steps)
@@ -71,8 +76,11 @@ def main():
     if unknown:
         sys.exit(f"error: results {', '.join(unknown)} must be among {', '.join(jobs)}")
     print(f"{'steps a second':18}{'alone':>10}{'the shipped run':>22}{'ratio':>10}{'updates':>10}", flush=True)
-    for name in names:
-        print(compare(name, jobs[name], options.seconds), flush=True)
+    try:
+        for name in names:
+            print(compare(name, jobs[name], options.seconds), flush=True)
+    except (OSError, RuntimeError, ValueError) as error:
+        sys.exit(f"error: {error}")
 
 
 if __name__ == "__main__":
