@@ -19,18 +19,12 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
-import run_seeds  # noqa: E402
+from same_training import first_jobs  # noqa: E402
 
 from common.command_line import OneLineParser, integer  # noqa: E402
 from common.curves import read_csv, read_curve  # noqa: E402
 
 SPS = "charts/SPS"
-
-
-def first_jobs() -> dict:
-    """{name of a results folder: its first job}."""
-    jobs = run_seeds.read_jobs(ROOT / "benchmarks" / "result_jobs.txt")
-    return {job.results.name: job for job in reversed(jobs)}
 
 
 def curve_of(job, seconds: int) -> dict:
@@ -58,11 +52,11 @@ def compare(name: str, job, seconds: int) -> str:
     curve = curve_of(job, seconds)
     if SPS not in curve:
         raise RuntimeError(f"{name} made no update in {seconds} s; give more --seconds")
-    shipped = read_csv(ROOT / "results" / name / "seeds" / f"{job.args['seed']}.csv")
+    shipped = read_csv(ROOT / name / "seeds" / f"{job.args['seed']}.csv")
     steps, speeds = curve[SPS]
     updates = len(steps)
     alone, beside = speeds[-1], shipped[SPS][1][updates - 1]
-    return f"{name:18}{alone:>10.0f}{beside:>22.0f}{alone / beside:>10.2f}{updates:>10}"
+    return f"{name:26}{alone:>10.0f}{beside:>22.0f}{alone / beside:>10.2f}{updates:>10}"
 
 
 def main():
@@ -71,11 +65,11 @@ def main():
     parser.add_argument("results", nargs="*", help="results folders; without one, all")
     parser.add_argument("--seconds", type=integer(5, 3600), default=50, help="seconds of each training")
     options = parser.parse_args()
-    names = [Path(path).name for path in options.results] or list(jobs)
+    names = options.results or list(jobs)
     unknown = sorted(set(names) - jobs.keys())
     if unknown:
         sys.exit(f"error: results {', '.join(unknown)} must be among {', '.join(jobs)}")
-    print(f"{'steps a second':18}{'alone':>10}{'the shipped run':>22}{'ratio':>10}{'updates':>10}", flush=True)
+    print(f"{'steps a second':26}{'alone':>10}{'the shipped run':>22}{'ratio':>10}{'updates':>10}", flush=True)
     try:
         for name in names:
             print(compare(name, jobs[name], options.seconds), flush=True)

@@ -176,8 +176,8 @@ EXPERIMENTS = {
         "Landing, failure at a random moment, the last command shown: share of the flights that landed",
         {
             **lengths(0, 1, 8, 32),
-            "mlp": "MLP of about the same size, width 192",
-            "no_blocks": "MLP, width 64: our network without its blocks",
+            "mlp": "MLP of about the same size",
+            "no_blocks": "MLP as wide as ours",
         },
         LANDED,
     ),

@@ -65,8 +65,8 @@ def differing(one, other):
 
 
 def first_jobs():
-    """{results folder: command} of each folder's first line."""
-    return {str(job.results): job.command for job in reversed(run_seeds.read_jobs(JOBS))}
+    """{results folder: its first job} of the list of results."""
+    return {str(job.results): job for job in reversed(run_seeds.read_jobs(JOBS))}
 
 
 def compare(name, command, commits, updates, temporary):
@@ -98,8 +98,8 @@ def main():
         sys.exit(f"error: results {', '.join(unknown)} must be among {', '.join(commits)}")
     try:
         with tempfile.TemporaryDirectory() as folder:
-            names, commands = options.results or commits, first_jobs()
-            same = [compare(name, commands[name], commits[name], options.updates, Path(folder)) for name in names]
+            names, jobs = options.results or commits, first_jobs()
+            same = [compare(name, jobs[name].command, commits[name], options.updates, Path(folder)) for name in names]
     except (OSError, RuntimeError, ValueError) as error:
         sys.exit(f"error: {error}")
     sys.exit(0 if all(same) else 1)

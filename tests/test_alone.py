@@ -14,15 +14,15 @@ def test_a_line_sets_a_training_beside_the_shipped_run_after_as_many_updates(mon
     third = float(list(csv.DictReader(DI.open()))[2]["charts/SPS"])
     curve = {alone.SPS: (np.array([1, 2, 3]), np.array([5.0, 6.0, 2 * third]))}
     monkeypatch.setattr(alone, "curve_of", lambda job, seconds: curve)
-    name, fast, shipped, ratio, updates = alone.compare("di", alone.first_jobs()["di"], 50).split()
-    assert (name, updates, ratio) == ("di", "3", "2.00")
+    name, fast, shipped, ratio, updates = alone.compare("results/di", alone.first_jobs()["results/di"], 50).split()
+    assert (name, updates, ratio) == ("results/di", "3", "2.00")
     assert float(fast) == pytest.approx(2 * third, abs=0.5) and float(shipped) == pytest.approx(third, abs=0.5)
 
 
 @pytest.mark.slow
 def test_a_training_is_started_and_its_folder_deleted():
     before = set((alone.ROOT / "runs").glob("*"))
-    alone.curve_of(alone.first_jobs()["di"], seconds=1)
+    alone.curve_of(alone.first_jobs()["results/di"], seconds=1)
     assert set((alone.ROOT / "runs").glob("*")) == before
 
 
