@@ -48,6 +48,7 @@ FIGURES = (  # the numbers of a held-out row: those of the first line whose keys
     {
         "failure_saved_rate": ("saved", 100, 1, " %"),
         "failure_error_median": ("‖error‖, median", 1, 5, ""),
+        "failure_error_p95": ("‖error‖, p95", 1, 4, ""),
         "failure_mass_short_mean_kg": ("short of the optimum", 1, 1, " kg"),
     },
     {"dispersed_error_median": ("‖error‖, median", 1, 5, ""), "dispersed_box_rate": ("in the box", 100, 1, " %")},
