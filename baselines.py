@@ -142,10 +142,11 @@ def optimise(
 
 
 def fly_solution(env_id: str, x0, u, cost, draw=None):
-    """Fly the controls u (n, T) from x0 (n, 2): what `envs.fly` returns, and `replay_error` (n,).
+    """Fly the controls u (n, T) or (n, T, m) from x0 (n, states): what `envs.fly` returns, and `replay_error` (n,).
 
     The replay error is the relative difference between the program's `cost` (n,) and the flight's. Above
-    `REPLAY_TOLERANCE` the program is not the environment's problem. Then NoOptimum is raised, which names the start.
+    `REPLAY_TOLERANCE` (with events `REPLAY_TOLERANCE_OF_EVENTS`) the program is not the environment's problem. Then
+    NoOptimum is raised, which names the start.
     """
     flight = fly(env_id, lambda obs, t: u[:, t].reshape(len(u), -1), x0, draw)
     # a cost below 1e-4 (a start within 0.003 of the origin) is compared absolutely, because of IPOPT's own tolerance
@@ -167,8 +168,8 @@ def reference(env_id: str, x0, processes: int | None = None, draw=None) -> dict:
 
     - for DoubleIntegrator-v0, LQR clipped at the bound, which is the bounded optimum from the start box (`box_qp`
       agrees)
-    - for other costs by weights with one phase, multiple shooting, which adds `replay_error` (n,)
-    - for costs by weights with several phases, `waypoint_reference`
+    - for other problems without circles that count, multiple shooting, which adds `replay_error` (n,)
+    - for costs by weights with circles, `waypoint_reference`
     - for costs by functions with circles, `reference_in_circles`
 
     Raises ValueError for an unknown id, a bad x0 or number of processes, and NoOptimum if a solve or replay fails.
@@ -293,7 +294,7 @@ def compare_single_phase(env_id: str, x0, flight: dict) -> dict:
     return numbers
 
 
-def compare_waypoints(env_id: str, x0, flight: dict) -> dict:
+def compare_waypoints(env_id: str, flight: dict) -> dict:
     """The optimum without circles beside the reference, and what hitting the circles costs and wins."""
     numbers = {"constrained_share": flight["constrained"].mean(), "infeasible_starts": int(flight["infeasible"].sum())}
     numbers["cost_free_mean"] = flight["cost_free"].mean()
@@ -356,7 +357,7 @@ def compare(env_id: str, x0, flight: dict, draw) -> dict:
     if not problem.weighted or problem.has_events or problem.scores or problem.bounds:
         return compare_finer(env_id, x0, flight, draw)
     if problem.circles_count:
-        return compare_waypoints(env_id, x0, flight)
+        return compare_waypoints(env_id, flight)
     return compare_single_phase(env_id, x0, flight)
 
 

@@ -360,7 +360,7 @@ def parse_args(argv=None):
     command = commands.add_parser(
         "opponents", help="classical guidance and other policies on the same dispersed flights"
     )
-    command.add_argument("folder", type=Path, help="results/<name> of a rocket with cut-off")
+    command.add_argument("folder", type=Path, help="results/<name> of a rocket with cut-off or a lander")
     command.add_argument("--dispersion", type=positive, default=1.0, metavar="D", help="default 1: envs.Dispersion")
     lost = "and failures that lose up to this share of thrust, from 0 to 0.3: default 0, none"
     command.add_argument("--failure", type=number(0, 0.3), default=0.0, metavar="K", help=lost)

@@ -80,7 +80,7 @@ class Args:
     dispersion: float = 0.0  # spread of the drawn vehicles, as a factor on `envs.Dispersion` (0: all are nominal)
     observe_draw: bool = False  # show the drawn vehicle to the policy, which no real flight could know
     observe_mass: bool = False  # show the true mass of a drawn rocket, not the flight computer's estimate
-    failure: float = 0.0  # half of the flights lose up to this share of thrust, in one of their burns (with cut-off)
+    failure: float = 0.0  # in half of the flights one group of engines loses up to this share (with cut-off)
     failure_time: str = "random"  # when thrust is lost: at a "random" moment or at the last stage's "ignition"
     navigation_noise: Numbers = None  # standard deviations, m and m/s, of the observed position and velocity
 
@@ -304,8 +304,9 @@ def set_curriculum(envs, args, progress):
     """Set what only training changes. Returns how many flights in a row have the same start or draw.
 
     R_terminal is -2 ln(1 + error / scale). Errors below the scale earn almost the same. Noise scatters the errors of
-    the flights by about std / 10. So the scale falls with the noise, as std / 8, if --log-std is a schedule. It is at
-    most TERMINAL_SCALE. It is at least 0.001 where flights differ, because a smaller scale is no better there.
+    the flights by about std / 10. We set the scale a little above that: it falls with the noise, as std / 8, if
+    --log-std is a schedule. It is at most TERMINAL_SCALE. It is at least 0.001 where flights differ, because a smaller
+    scale is no better there.
 
     With failures at random moments, every second update flies failures of the last stage at its ignition. They are the
     hardest to save, and rare among random ones.

@@ -137,4 +137,4 @@ class BatchedTask(SampledTask):
         )
 
     def fly_opponents(self, folder, **options) -> None:
-        raise BadInput(f"the env_id of {folder} is {self.env_id}; it must be a rocket's with cut-off")
+        raise BadInput(f"the env_id of {folder} is {self.env_id}; it must be a rocket's with cut-off or a lander's")

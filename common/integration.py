@@ -24,9 +24,10 @@ def exp(x):
 
 
 ROOT_TOLERANCE = 1e-12  # relative to the value at the begin
+EVALUATIONS = 14
 
 
-def falling_root(value, begin, end, until, evaluations=14):
+def falling_root(value, begin, end, until):
     """The times (n,) in (0, until] at which value(h (n,)) falls through 0, where it is 0 to 1e-12 of `begin`.
 
     begin > 0 >= end are the values at 0 and at `until` (n,). A value that is above 0 only by rounding counts as 0,
@@ -39,7 +40,7 @@ def falling_root(value, begin, end, until, evaluations=14):
     f_low = begin.copy()
     f_high = np.minimum(end, -1e-300)
     last = np.zeros(len(begin))  # 1: the last round replaced `high`, -1: `low`
-    for _ in range(evaluations):
+    for _ in range(EVALUATIONS):
         h = np.clip(high - f_high * (high - low) / (f_high - f_low), low, high)
         f = value(h)
         below = f <= ROOT_TOLERANCE * begin

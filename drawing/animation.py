@@ -65,11 +65,10 @@ class Sheet:
         self.figure.text(0.5, 0.955, title, ha="center", fontsize=10)
         self.moving, self._limits, self._still = [], None, None
 
-    def panel(self, box, title: str = "", **labels):
+    def panel(self, box, **labels):
         """Axes at `box` (left, bottom, width, height as shares of the sheet), small text, a pale grid."""
         ax = self.figure.add_axes(box)
         ax.set(**labels)
-        ax.set_title(title, fontsize=9)
         ax.tick_params(labelsize=7, length=2)
         ax.xaxis.label.set_size(8)
         ax.yaxis.label.set_size(8)

@@ -58,7 +58,10 @@ def training_figure(curves: list[dict], title: str, reference_return: float, mis
 
 
 def plot_seeds(ax, logged: list[tuple], actions: str):
-    """One curve, or the curves of several seeds and their median; (steps, values) each, of `actions` of that kind."""
+    """One curve, or the curves of several seeds and their median.
+
+    `logged` has (steps, values) of each seed. `actions`, "mean" or "sampled", is for the label.
+    """
     if len(logged) > 1:
         for k, (steps, values) in enumerate(logged):
             ax.plot(steps, values, color="tab:red", linewidth=0.7, alpha=0.4, label="" if k else "each seed")

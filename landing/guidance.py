@@ -209,9 +209,9 @@ class Replanned:
     IPOPT fails, the last plan is kept. Without any plan DR/DV flies.
 
     With `is_wary` plans use little thrust until a failure is seen, so that a failure can still be survived. The optimum
-    of a whole engine falls fast and brakes late. In 200 flights of another seed than docs/landing.md has, failures at
-    random moments struck 79. This is what became of the 79, and how much more the law burns than the optimum that knows
-    all:
+    of a whole engine falls fast and brakes late. We flew 200 draws of a seed that docs/landing.md does
+    not use; failures at random moments struck 79. The table has the share of the 79 that did not land softly, and the
+    propellant beyond that of the optimum, which knows all:
 
                 not soft   propellant
         plain   53 %       +1.4 %

@@ -106,7 +106,9 @@ def near_origin_metrics(problem: Problem, x0: np.ndarray, cost: np.ndarray, refe
 
 
 def cost_parts(problem: Problem, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """State, control and terminal part (n, 3) of the cost J of flights x (n, T+1, 2), u (n, T) (the paper's Eq. of J).
+    """State, control and terminal part (n, 3) of the cost J of flights: the paper's Eq. of J.
+
+    x (n, T+1, states), u (n, T) or (n, T, m).
 
     eval.npz holds the flights and their total cost; the figures take its parts from here. Of costs by weights, without
     events: those of functions are told in eval.json alone.

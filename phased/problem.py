@@ -314,7 +314,7 @@ PROBLEMS = Tables()  # `register_problem` of `environment.py` fills it
 
 
 def starts(seed: int, n: int, x0_max: float | tuple[float, ...] = 1.0) -> np.ndarray:
-    """The n starts (n, 2) of a seed, in evaluations and references, uniform in [-x0_max, x0_max] in each component.
+    """The n starts (n, states) of a seed, uniform in [-x0_max, x0_max] in each component.
 
     `x0_max` is the problem's: a number for each state, or one number for two states. 1 is the paper's "state bounds".
     """

@@ -167,4 +167,4 @@ class PhasedTask(SampledTask):
         return self.report(self.env_id, args.starts, args.seed)
 
     def fly_opponents(self, folder, **options) -> None:
-        raise BadInput(f"the env_id of {folder} is {self.env_id}; it must be a rocket's with cut-off")
+        raise BadInput(f"the env_id of {folder} is {self.env_id}; it must be a rocket's with cut-off or a lander's")

@@ -314,10 +314,13 @@ class Comparison:
         return report
 
 
-def recorded_flights(arrays: dict, rocket: Rocket, dispersion: float) -> dict:
-    """The flights (n,) of eval.npz's arrays, in the form that `dispersed_metrics` reads."""
+def recorded_flights(arrays: dict, rocket: Rocket, dispersion: float, **failing) -> dict:
+    """The flights (n,) of eval.npz's arrays, in the form that `dispersed_metrics` reads.
+
+    `failing` are `failure` and `failure_time`, unless all of them are healthy.
+    """
     y = arrays["final_y"]
-    burn_out = draw_vehicles(rocket, dispersion, arrays["draw"]).burn_out
+    burn_out = draw_vehicles(rocket, dispersion, arrays["draw"], **failing).burn_out
     flights = final_elements(y, rocket) | {"final_mass_kg": y[:, 6]}
     flights |= {
         "error_norm": np.linalg.norm(arrays["final_error"], axis=1),
@@ -331,7 +334,7 @@ def recorded_flights(arrays: dict, rocket: Rocket, dispersion: float) -> dict:
 # ---------------------------------------------------------------------------------------------------------------------
 
 COLUMNS = ("flights", "||error|| median", "p95", "max", "perigee off (km)", "in the box (95 %)", "mass (kg)")
-COLUMNS += ("of the bound", "orbit reached", "a decision", "knows")
+COLUMNS += ("of the optimum", "orbit reached", "a decision", "knows")
 WIDTHS = (7, 16, 8, 8, 16, 24, 9, 14, 14, 10, 0)
 WHEN = {"random": "from a random moment of a burn on", "ignition": "from the last stage's ignition on"}
 

@@ -62,16 +62,13 @@ class Vehicles(NamedTuple):
     burn_out: np.ndarray  # (N,) s, when the last stage has burnt as much as nominally, or runs dry
     wind: np.ndarray  # (2, N) m/s towards east and north, where the profile of `wind_velocity` is 1
     drag: np.ndarray  # (N,) factor on the drag
-    failure: np.ndarray  # (3, N) burn, moment (s) and share lost; -1, 0, 0 for a healthy flight
+    failure: np.ndarray  # (3, N) group of engines, moment (s) and share lost; -1, 0, 0: healthy
 
 
 def draw_names(rocket: Rocket) -> tuple[str, ...]:
     """The names of the k scores of a draw. Types of engines are counted from 1."""
     types = range(1, len(engine_types(rocket)) + 1)
     return (*(f"{name}_{j}" for name in OF_ENGINES for j in types), *OF_FLIGHT)
-
-
-DRAW = draw_names(ROCKET)
 
 
 def draw_sigmas(rocket: Rocket) -> np.ndarray:

@@ -86,7 +86,8 @@ class Steps(NamedTuple):
 class RocketVectorEnv(BatchedEnv):
     """N launches of a mission's rocket into its orbit, steered by the thrust direction, in steps of 2 s.
 
-    Observation: [r (3) m, v (3) m/s, m kg, t_norm, phi], r and v in ECI. t_norm is 1 - t / rocket.end_time (961 s). phi
+    Observation: [r (3) m, v (3) m/s, m kg, t_norm, phi], r and v in ECI. t_norm, the paper's name, is the time that is
+    left, 1 - t / rocket.end_time (961 s). phi
     is the phase at the step's start, from 0 to 1 (the paper counts 0 to 3). A burn is a phase.
 
     Action: the thrust direction, of any length but 0, which raises BadInput. It is normalised here and held in ECI over
@@ -264,7 +265,7 @@ class RocketVectorEnv(BatchedEnv):
     def _start(self, mask, options):
         taken = ["draw"] * self.has_draws + ["noise"] * bool(self.navigation_noise)
         if options.keys() - set(taken):
-            allowed = "without dispersion a rocket has no options"
+            allowed = "a rocket has none without dispersion, failure or navigation noise"
             if taken:
                 allowed = f"the only one is {taken[0]!r}" if len(taken) == 1 else "there are 'draw' and 'noise'"
             raise BadInput(f"reset options are {options!r}; {allowed}")
@@ -716,8 +717,9 @@ def register_rocket(env_id: str, rocket: Rocket, cutoff: bool = False, ceiling_k
     others = gym.registry.keys() - ROCKETS.keys()
     if env_id in others or not ENV_ID_RE.fullmatch(env_id) or "/" in env_id:
         raise BadInput(f"env_id is {env_id!r}; it must be a new id such as MyRocket-v0")
-    for name in rules.keys() - {field.name for field in fields(Mission)}:
-        raise BadInput(f"a keyword is {name!r}; it must be a field of Mission (`late` is now `floor_from`)")
+    names = [field.name for field in fields(Mission)]
+    for name in rules.keys() - set(names):
+        raise BadInput(f"a keyword is {name!r}; it must be one of {', '.join(names)}")
     mission = Mission(rocket, cutoff, ceiling_km, **rules)
     if ROCKETS.get(env_id, mission) != mission:
         warnings.warn(f"{env_id} was another rocket's id; from here on it is this one's", stacklevel=2)

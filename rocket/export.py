@@ -52,14 +52,23 @@ def step_columns(rocket: Rocket, arrays: dict, launch_longitude: float) -> dict[
     }
 
 
-def flight_columns(rocket: Rocket, arrays: dict, dispersion: float) -> dict[str, np.ndarray]:
-    """The columns of the dispersed flights, a row for each: standard scores, end and orbit."""
-    flights = recorded_flights(arrays, rocket, dispersion)
+def flight_columns(rocket: Rocket, arrays: dict, dispersion: float, **failing) -> dict[str, np.ndarray]:
+    """The columns of the flights that differ, a row for each: standard scores, failure, end and orbit.
+
+    `failing` are `failure` and `failure_time`. A flight with a failure has the group of engines that fails, from 1, the
+    moment (s) and the share of thrust lost; a healthy one has zeros.
+    """
+    flights = recorded_flights(arrays, rocket, dispersion, **failing)
+    scores = draw_names(rocket)
+    strikes = {}
+    if failing:
+        strikes = named(("failed_group", "failure_t_s", "thrust_lost"), arrays["failure"] + [1, 0, 0])
     orbit = {key: flights[key] for key in ("error_norm", "a_km", "e", "i_deg", "raan_deg", "argp_deg")}
     perigee, apogee = (apsides_of(flights, rocket)[key] for key in ("perigee_km", "apogee_km"))
     return {
         "flight": np.arange(len(arrays["draw"])),
-        **named([f"score_{name}" for name in draw_names(rocket)], arrays["draw"]),
+        **named([f"score_{name}" for name in scores], arrays["draw"][:, : len(scores)]),
+        **strikes,
         "t_s": arrays["final_t"],
         **named(STATE, arrays["final_y"]),
         **orbit,

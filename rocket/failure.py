@@ -19,7 +19,7 @@ FAILURE_TIMES = ("random", "ignition")
 LARGEST_FAILURE = 0.3  # share of thrust
 FAILURE_PROBABILITY = 0.5
 # uniform numbers from 0 to 1; a flight fails if the first is below `FAILURE_PROBABILITY`
-FAILURE_DRAW = ("failure", "failed_burn", "moment", "share")
+FAILURE_DRAW = ("failure", "failed_group", "moment", "share")
 HEALTHY_DRAW = (1.0, 0.0, 0.0, 0.0)
 NEEDS_CUTOFF = "must be 0 where flights end at a fixed time: engines that burn for longer need an id with cut-off"
 

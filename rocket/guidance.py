@@ -126,7 +126,7 @@ def cutoff_jacobian(rocket: Rocket, y, rate):
     return error @ (np.eye(6) - np.outer(rate, energy) / (energy @ rate))
 
 
-def lqr_gains(mission: Mission, flight: dict, steering_weight: float = STEERING_WEIGHT):
+def lqr_gains(mission: Mission, flight: dict):
     """Gains G_k (K, 2, 6) of da_k = -G_k dx_k and the axes (K, 2, 3) of the angles, by the backward Riccati recursion.
 
     They minimise |terminal error|^2 + sum of R dt |da|^2 along the linearised flight (e.g. Anderson and Moore, Optimal
@@ -145,7 +145,7 @@ def lqr_gains(mission: Mission, flight: dict, steering_weight: float = STEERING_
     P = C.T @ C
     gains = np.empty((len(B), 2, 6))
     for k in reversed(range(len(B))):
-        gains[k] = np.linalg.solve(steering_weight * dt[k] * np.eye(2) + B[k].T @ P @ B[k], B[k].T @ P @ A[k])
+        gains[k] = np.linalg.solve(STEERING_WEIGHT * dt[k] * np.eye(2) + B[k].T @ P @ B[k], B[k].T @ P @ A[k])
         P = A[k].T @ P @ (A[k] - B[k] @ gains[k])
         P = (P + P.T) / 2
     return gains, axes
@@ -162,9 +162,9 @@ class Tracked(NamedTuple):
     energy: np.ndarray  # (K+1 - ignition,) J/kg from the ignition on, without the falls that rounding makes
 
 
-def tracked(mission: Mission, flight: dict, steering_weight: float = STEERING_WEIGHT) -> Tracked:
+def tracked(mission: Mission, flight: dict) -> Tracked:
     """A flight (t, u, y) of a mission with its gains."""
-    gains, axes = lqr_gains(mission, flight, steering_weight)
+    gains, axes = lqr_gains(mission, flight)
     y, u = flight["y"], flight["u"]
     # the last step is cut short, so its own gain is far too large for a whole step
     gains[-1] = gains[-2]
@@ -174,7 +174,7 @@ def tracked(mission: Mission, flight: dict, steering_weight: float = STEERING_WE
     return Tracked(y, u, gains, axes, ignition, energy)
 
 
-def tvlqr(env_id: str, by_energy: bool = False, steering_weight: float = STEERING_WEIGHT):
+def tvlqr(env_id: str, by_energy: bool = False):
     """The law of an LQR about the optimum, by time, or from the last ignition on by the specific energy (`by_energy`).
 
     By time, the last direction and the last whole step's gain are held from the optimum's end until the cut-off. By
@@ -190,7 +190,7 @@ def tvlqr(env_id: str, by_energy: bool = False, steering_weight: float = STEERIN
         1e-9    1.9e-5    1.3e-5 (a greater p95)
     """
     mission = ROCKETS[env_id]
-    y, u, gains, axes, ignition, energy = tracked(mission, nominal_optimum(env_id), steering_weight)
+    y, u, gains, axes, ignition, energy = tracked(mission, nominal_optimum(env_id))
     phi_last = min(len(mission.rocket.burns) - 1, 1)  # as observed in the last burn
 
     def policy(obs, t):

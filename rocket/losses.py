@@ -61,7 +61,7 @@ def groups(failure: np.ndarray, largest: float) -> dict[str, np.ndarray]:
     return found
 
 
-def savable_flights(arrays: dict) -> np.ndarray:
+def can_reach_orbit(arrays: dict) -> np.ndarray:
     """The flights (n,) that can reach the orbit: healthy ones, and those whose optimum ends above the dry mass."""
     is_healthy = arrays["failure"][:, 0] < 0
     return is_healthy | (arrays["best_mass_kg"] > arrays["dry_mass_kg"])
@@ -126,7 +126,7 @@ def loss_report(arrays: dict, names: list[str], largest: float) -> dict:
     arrays are those of `Comparison.flights_by_loss`. A law is measured on all its flights. It is compared on the first
     flights, which both laws flew.
     """
-    savable = savable_flights(arrays)
+    savable = can_reach_orbit(arrays)
     laws = {name: Ends.of(arrays, name) for name in names}
     standard = laws[STANDARD]
     report = {}

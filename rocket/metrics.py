@@ -213,7 +213,7 @@ def dispersed_metrics(flights: dict, rocket: Rocket) -> dict:
     return {key: float(value) for key, value in metrics.items() if np.isfinite(value)} | counts
 
 
-def savable_flights(arrays: dict, best_mass: np.ndarray, dry_mass: np.ndarray) -> np.ndarray:
+def savable_failures(arrays: dict, best_mass: np.ndarray, dry_mass: np.ndarray) -> np.ndarray:
     """The flights (n,), as a mask, that lose thrust and can still reach their orbit.
 
     best_mass (n,) in kg is what is left in the target orbit by the optimum that knows of the failure from its strike
@@ -226,12 +226,12 @@ def savable_flights(arrays: dict, best_mass: np.ndarray, dry_mass: np.ndarray) -
 def failure_metrics(arrays: dict, best_mass: np.ndarray, mass_reached: np.ndarray, dry_mass: np.ndarray) -> dict:
     """The statistics of the flights with a failure, from the arrays that `evaluate_dispersed` returns for n flights.
 
-    best_mass and dry_mass (n,) in kg are those of `savable_flights`. Errors and the saved rate are those of the savable
-    flights. The missing mass is that of the saved flights, beside mass_reached (n,) in kg: what the same optimum has
-    left in the orbit that the flight reached.
+    best_mass and dry_mass (n,) in kg are those of `savable_failures`. Errors and the saved rate are those of the
+    savable flights. The missing mass is that of the saved flights, beside mass_reached (n,) in kg: what the same
+    optimum has left in the orbit that the flight reached.
     """
     has_failed = ~healthy(arrays)
-    savable = savable_flights(arrays, best_mass, dry_mass)
+    savable = savable_failures(arrays, best_mass, dry_mass)
     errors = np.linalg.norm(arrays["final_error"], axis=1)
     saved = savable & (errors < SUCCESS)
     counts = {"failure_starts": int(has_failed.sum()), "failure_savable": int(savable.sum())}

@@ -92,6 +92,8 @@ def terminal_error(state, rocket: Rocket = ROCKET) -> np.ndarray:
 def local_frame(y, normal):
     """Unit vectors up, along-track (normal x up), cross-track (up x along) at states y (7, N): (3, N) each.
 
+    `normal` (3,) is the unit normal of the target's plane, in ECI.
+
     The products are written out, because a matrix product would round a row differently in a larger batch.
     """
     up = y[:3] / np.sqrt((y[:3] ** 2).sum(axis=0))

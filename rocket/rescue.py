@@ -58,9 +58,9 @@ def solve_rescue(job):
     orbit = target_orbit(rocket.target, rocket.mu)
     healthy = guidance.solve_drawn((rocket, failing.dispersion, z, orbit, guess))
     vehicle = draw_vehicles(rocket, failing.dispersion, z[None], failing.failure, failing.failure_time)
-    burn, moment, _ = vehicle.failure[:, 0]
+    group, moment, _ = vehicle.failure[:, 0]
     # no failure, or one after the cut-off, or one in the environment's last step, after which no direction is chosen
-    if healthy is None or burn < 0 or moment > healthy["final_time"] - rocket.dt:
+    if healthy is None or group < 0 or moment > healthy["final_time"] - rocket.dt:
         return healthy
     before = draw_vehicles(rocket, failing.dispersion, z[None])
     intervals = guidance.drawn_intervals(rocket, guess["t"][-1])
@@ -178,12 +178,12 @@ class Known(NamedTuple):
         return self.mass + (self.price * np.hstack([error[:, :3], in_plane])).sum(axis=1)
 
 
-def solve_known(env_id: str, mission: Mission, failing: Failing, z: np.ndarray, processes: int | None = None) -> Known:
+def solve_known(env_id: str, mission: Mission, failing: Failing, z: np.ndarray) -> Known:
     """`Known` of draws z (n, k + 4)."""
     vehicles = draw_vehicles(mission.rocket, failing.dispersion, z, failing.failure, failing.failure_time)
     has_failed = np.flatnonzero(vehicles.failure[0] >= 0)
     known = Known(np.full(len(z), np.nan), np.full((len(z), 5), np.nan))
-    for k, optimum in zip(has_failed, failing_optima(env_id, mission, failing, z[has_failed], processes)):
+    for k, optimum in zip(has_failed, failing_optima(env_id, mission, failing, z[has_failed])):
         if optimum:
             known.mass[k] = optimum["final_mass"]
             known.price[k] = optimum["orbit_price"]

@@ -12,8 +12,8 @@ def orbital_reward(distance, next_distance):
     """R_orbital = 10 (L_t - L_{t+1}), where L is the sum of |component| of the terminal error in the target's axes.
 
     The paper speaks of "exponential shaping". This form is linear. Over an episode it adds up to 10 (L_0 - L_T). So it
-    is the objective, and no policy-invariant shaping. L is a sum, because a norm hides small components behind the
-    largest.
+    is the objective itself, not a shaping that leaves the best policy unchanged. L is a sum, because a norm hides small
+    components behind the largest.
     """
     return 10.0 * (distance - next_distance)
 

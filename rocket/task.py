@@ -30,7 +30,7 @@ from rocket.metrics import (
     lowest_key,
     perigee_longitude,
     rocket_metrics,
-    savable_flights,
+    savable_failures,
 )
 from rocket.missions import ROCKETS, Mission
 from rocket.navigation import ALLOWED, NOMINAL_FLIGHT, flight_noise, is_noise, noise_metrics
@@ -130,7 +130,7 @@ class RocketTask:
         known = known_optima(self.env_id, self.mission, failing, eval_seed, len(arrays["draw"]))
         vehicles = draw_vehicles(self.mission.rocket, failing.dispersion, arrays["draw"])
         errors = np.linalg.norm(arrays["final_error"], axis=1)
-        saved = savable_flights(arrays, known.mass, vehicles.dry_mass) & (errors < SUCCESS)
+        saved = savable_failures(arrays, known.mass, vehicles.dry_mass) & (errors < SUCCESS)
         if not saved.any():
             return {}
         k = int(np.where(saved, arrays["final_t"], 0.0).argmax())
@@ -287,9 +287,11 @@ class RocketTask:
         return export.step_columns(self.mission.rocket, arrays, launch_longitude)
 
     def flight_columns(self, arrays: dict, metrics: dict) -> dict:
-        if "dispersion" not in metrics:
-            raise BadInput(f"the evaluation of {self.env_id} holds one flight; --flights needs one with --dispersion")
-        return export.flight_columns(self.mission.rocket, arrays, metrics["dispersion"])
+        if "draw" not in arrays:
+            needs = "--flights needs one with --dispersion or --failure"
+            raise BadInput(f"the evaluation of {self.env_id} holds one flight; {needs}")
+        failing = {key: metrics[key] for key in ("failure", "failure_time") if key in metrics}
+        return export.flight_columns(self.mission.rocket, arrays, metrics.get("dispersion", 0.0), **failing)
 
     def track(self, arrays: dict) -> Track:
         return export.earth_track(self.env_id, self.mission.rocket, arrays)
@@ -315,6 +317,7 @@ class RocketTask:
 
     def baseline_command(self, args) -> tuple[dict, dict]:
         if not args.failure:
+            refuse_unless(not args.dispersion, "--dispersion", args.dispersion, "must be 0 without --failure")
             return report_rocket(self.env_id)
         refuse_unless(self.mission.cutoff, "--failure", args.failure, NEEDS_CUTOFF)
         failing = Failing(args.dispersion, args.failure, args.failure_time)

@@ -15,10 +15,11 @@ from rocket_oracle import CUTOFF, FIXED, LEO, MU, OMEGA, RE, between_events, ene
 
 import envs
 from envs import ROCKET, ROCKETS, BadInput, ascent_dynamics, fly_rocket
-from rocket.dispersion import DRAW
+from rocket.dispersion import draw_names
 from rocket.vehicle import STAGE_1, STAGE_2, engine_groups
 
 IDS = [FIXED, CUTOFF, LEO]
+DRAW = draw_names(ROCKET)
 LEO_DRAW = ["burn_rate_1", "burn_rate_2", "isp_1", "isp_2", "propellant_1", "propellant_2", "dry_mass_1", "dry_mass_2"]
 LEO_DRAW += ["payload", "drag", "wind_east", "wind_north"]
 
@@ -632,7 +633,7 @@ def test_a_refused_reset_leaves_the_flight_as_it_was():
 
 
 def test_bad_options_are_refused():
-    with pytest.raises(BadInput, match="'draw'.*without dispersion a rocket has no options"):
+    with pytest.raises(BadInput, match="'draw'.*a rocket has none without dispersion, failure or"):
         gym.make_vec(CUTOFF).reset(options={"draw": np.zeros((1, 16))})
     with pytest.raises(BadInput, match="the only one is 'draw'"):
         make(CUTOFF).reset(options={"x0": 1})

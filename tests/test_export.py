@@ -224,6 +224,22 @@ def test_a_monte_carlo_has_the_statistics_of_its_evaluation(tmp_path):
     assert abs(found["score_drag"].std() - 1) < 0.05  # standard scores
 
 
+def test_a_monte_carlo_with_failures_tells_what_failed(tmp_path):
+    """The healthy flights have their evaluation's statistics. A loss of thrust is one of flow, too: none runs dry."""
+    found = table(exported("rocket_failures", "flights", tmp_path))
+    metrics = json.loads((RESULTS / "rocket_failures" / "eval.json").read_text())
+    is_healthy = found["failed_group"] == 0
+    assert is_healthy.sum() == metrics["dispersed_starts"] and (~is_healthy).sum() == metrics["failure_starts"]
+    assert np.median(found["error_norm"][is_healthy]) == pytest.approx(metrics["dispersed_error_median"], rel=1e-9)
+    in_orbit = found["error_norm"] < 0.02
+    assert in_orbit[~is_healthy].mean() == pytest.approx(metrics["failure_saved_rate"], rel=1e-12)
+    assert not found["dry"][in_orbit].any()
+    assert not found["thrust_lost"][is_healthy].any() and 0 < found["thrust_lost"][~is_healthy].min()
+    assert found["thrust_lost"].max() <= metrics["failure"]
+    assert set(found["failed_group"]) == {0, 1, 2, 3, 4}  # the paper's rocket has four groups
+    assert (found["failure_t_s"][~is_healthy] > 0).all()
+
+
 def steer(obs, t):
     """A lander's thrust that ends somewhere on the ground."""
     left = np.maximum(45.0 - obs[:, 6:7], 4.0)

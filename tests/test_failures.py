@@ -12,9 +12,10 @@ from rocket_oracle import CUTOFF, FIXED, LEO, PAPER, between_events
 
 import envs
 from envs import ROCKET, ROCKETS, BadInput, fly_rocket
-from rocket.dispersion import DRAW
+from rocket.dispersion import draw_names
 from rocket.metrics import draws
 
+DRAW = draw_names(ROCKET)
 SCORES = len(DRAW)
 LARGEST = 0.3
 # of the paper's engines: how many, thrust (N), flow (kg/s), kg that are dropped with them, s that they burn
@@ -375,7 +376,7 @@ def test_options_that_do_not_fit_are_one_line(create):
     [
         (np.zeros(SCORES + 3), r"of shape \(1, 19\); it must hold .*\(1, 16\) or \(1, 20\): burn_rate_1, .*, share$"),
         (np.full(SCORES + 4, np.nan), "is nan; it must hold finite numbers"),
-        (np.append(np.zeros(SCORES), [0.0, 1.5, 0, 0]), "^failed_burn of .* is 1.5; it must be from 0 to 1$"),
+        (np.append(np.zeros(SCORES), [0.0, 1.5, 0, 0]), "^failed_group of .* is 1.5; it must be from 0 to 1$"),
         (np.append(np.zeros(SCORES), [-0.1, 0, 0, 0]), "^failure of .* is -0.1; it must be from 0 to 1$"),
     ],
 )

@@ -20,13 +20,14 @@ import runs
 from common.tasks import task_of
 from envs import ROCKET, ROCKETS, BadInput, fly_rocket
 from rocket import comparison, guidance, rescue
-from rocket.dispersion import DRAW
+from rocket.dispersion import draw_names
 from rocket.metrics import draws, evaluate_dispersed, failure_metrics
 from rocket.optimum import rocket_reference
 from rocket.orbits import target_axes, target_orbit
 from rocket.rescue import Failing, Known
 
 ROOT = Path(__file__).parents[1]
+DRAW = draw_names(ROCKET)
 SCORES = len(DRAW)
 PROTOCOL = Failing(1.0, 0.3, "random")
 FLIGHTS = 12
@@ -182,7 +183,7 @@ def no_solves(monkeypatch, tmp_path):
     """From here on whatever is solved is counted, and has no mass; the stored files are those of an empty folder."""
     solved = []
 
-    def solve_known(env_id, mission, failing, z, processes=None):
+    def solve_known(env_id, mission, failing, z):
         solved.append(len(z))
         return Known(np.full(len(z), np.nan), np.full((len(z), 5), np.nan))
 
