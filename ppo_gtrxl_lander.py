@@ -130,8 +130,8 @@ OURS = {
     "mlp_dim": 64,
     "hidden_dim": 64,
     "total_updates": 280,
-    "num_envs": 1024,  # with fewer flights an update, the policy burns more
-    "num_minibatches": 32,
+    "num_envs": 1536,  # with fewer flights an update, the policy burns more
+    "num_minibatches": 48,
     "flights_per_start": "0:32 0.7:32 0.7001:16",  # more draws late
     "update_epochs": 4,
     "learning_rate": 3e-3,
@@ -143,7 +143,7 @@ OURS = {
     "target_kl": 0.03,
     "memory_noise": "0:0.01 1:0",
     "log_std": "0:-1 0.6:-2.5 1:-3.6",  # a policy that learned with less noise has less reserve
-    "fuel_weight": "0:4 0.2:4 0.4:12",
+    "fuel_weight": "0:4 0.12:4 0.25:12",
     "slope_weight": "0:0 0.5:0 0.7:2",  # only late, because few descents are steep while the noise is large
     "weight_average": 0.998,
     "decision_s": 0.4,
@@ -156,7 +156,7 @@ MARS = {
     "failure_emphasis": 1.2,  # six flights in ten fail
     "failed_fuel_share": 0.3,  # they need a reserve of propellant, healthy flights need none
     "thrust_share": 0.8,  # the rest of the thrust is a reserve
-    "start_spread": 1.5,  # less thrust sideways is as if the pad were farther and the start faster
+    "start_spread": 1.9,  # less thrust sideways is as if the pad were farther and the start faster
     "wind": 0.7,  # a policy has to notice that its motion answers less than it expects
     "longest_flight": 60.0,  # flights of learned policies take 45 s
 }

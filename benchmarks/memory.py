@@ -182,8 +182,8 @@ EXPERIMENTS = {
         LANDED,
     ),
     "lander_recipe": Experiment(
-        "Landing, the whole training of results/mars_landing, failure from the start",
-        {"memory_0": "L_mem 0", "../../mars_landing": "L_mem 8", "mlp": "MLP of about the same size"},
+        "Landing, a whole training with 1024 flights an update, failure from the start",
+        {"memory_0": "L_mem 0", "memory_8": "L_mem 8", "mlp": "MLP of about the same size"},
         LANDED,
         drawn=False,
     ),
