@@ -121,7 +121,7 @@ class Args:
     weight_average: float = 0.0  # decay, per optimiser step, of the averaged weights used in evaluation
 
 
-# Recipes: the values that we replace (docs/decisions.md has Table 1's beside them, docs/method.md the reasons) --------
+# Recipes: the values that we replace (docs/landing.md#how-it-is-trained has the reasons) ------------------------------
 OURS = {
     "num_blocks": 2,  # a laptop's network, a hundredth of Table 1's weights
     "embed_dim": 64,
@@ -130,7 +130,7 @@ OURS = {
     "mlp_dim": 64,
     "hidden_dim": 64,
     "total_updates": 280,
-    "num_envs": 1536,  # with fewer flights an update, the policy burns more
+    "num_envs": 1536,  # with 1024 flights an update, seed 1 burns more
     "num_minibatches": 48,
     "flights_per_start": "0:32 0.7:32 0.7001:16",  # more draws late
     "update_epochs": 4,
@@ -231,7 +231,7 @@ def set_curriculum(envs, args, progress):
     """Set what only training changes. Returns how many flights in a row have the same draw.
 
     The terminal reward tells errors apart only above its scales. Noise scatters flights in proportion to its std. So
-    the scales fall with the noise if --log-std is a schedule. They end at the scales of evaluations.
+    the scales fall with the noise if --log-std is a schedule. They never fall below those of evaluations.
     """
     if isinstance(args.log_std, str):
         std = math.exp(value_at(args.log_std, progress))
