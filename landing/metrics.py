@@ -91,7 +91,7 @@ def evaluate_policy(env_id: str, policy: Callable, reference: dict, eval_seed: i
 
 
 def flight_arrays(flown: dict, reference: dict) -> dict:
-    """The arrays of eval.npz. Flights are recorded by periods of 0.2 s, its `decision_s`. That of eval.json is another."""
+    """The arrays of eval.npz. Its `decision_s` is 0.2 s, the period by which flights are recorded."""
     kept = ("u", "effectiveness", "y", "start", "gravity", "draw", "final_y", "slope", "fuel_kg")
     arrays = {key: flown[key] for key in kept}
     arrays |= {"decision_s": np.array(PERIOD), "final_t": flown["final_time"]}
