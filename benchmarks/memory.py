@@ -117,7 +117,6 @@ EXPERIMENTS = {
         {
             **lengths(0, 32),
             "shown_memory_0": "L_mem 0, both shown",
-            "../clock/memory_0": "L_mem 0, both and a clock's hands",
             "../../di_waypoints": "L_mem 32, both shown",
         },
         {
