@@ -317,7 +317,7 @@ class Comparison:
 def recorded_flights(arrays: dict, rocket: Rocket, dispersion: float, **failing) -> dict:
     """The flights (n,) of eval.npz's arrays, in the form that `dispersed_metrics` reads.
 
-    `failing` are `failure` and `failure_time`, unless all of them are healthy.
+    Flights with failures need `failure` and `failure_time` of their evaluation.
     """
     y = arrays["final_y"]
     burn_out = draw_vehicles(rocket, dispersion, arrays["draw"], **failing).burn_out

@@ -52,8 +52,11 @@ def test_a_policy_was_trained_by_the_command_that_its_list_gives(folder, monkeyp
     script = importlib.import_module(Path(job.command[0]).stem)
     args = vars(script.Args()) | args  # a flag that came after the policy has its default
     table = vars(envs.LANDERS[args["env_id"]]) if args["env_id"] in envs.LANDERS else {}
-    given = lambda args: {name: table.get(name) if value is None else value for name, value in args.items()}  # noqa: E731
-    differ = {name for name, value in given(job.args).items() if given(args)[name] != value}
+
+    def given(name, value):
+        return table.get(name) if value is None else value
+
+    differ = {name for name, value in job.args.items() if given(name, args[name]) != given(name, value)}
     assert differ <= {"exp_name", "eval_starts"}
     assert on_gpu or set(job.command[1::2]) <= {"--env-id", "--dispersion", "--failure", "--seed"}
 
