@@ -286,7 +286,7 @@ def compare_double_integrator(env_id: str, x0, flight: dict) -> dict:
 def compare_single_phase(env_id: str, x0, flight: dict) -> dict:
     """The paper's other references: direct collocation (as solved, and flown) and LQR about the target."""
     u, cost, _, _ = optimise(env_id, x0, hermite_simpson)
-    collocated = fly(env_id, lambda obs, t: u[:, t, None], x0)["cost"]
+    collocated = fly(env_id, lambda obs, t: u[:, t].reshape(len(u), -1), x0)["cost"]
     linear = fly(env_id, lqr_policy(PROBLEMS[env_id]), x0)["cost"]
     numbers = {}
     for name, other in (("collocation", cost), ("collocation_flown", collocated), ("lqr", linear)):

@@ -120,7 +120,9 @@ def shorten(run_dir) -> Path:
         policy = staged / "agent.safetensors"
         write_bfloat16(run_dir / "agent.safetensors", policy)
         flags: dict = {"checkpoint": policy, "eval-npz": staged / "eval.npz", "eval-json": staged / "eval.json"}
-        flags |= {name: args[name] for name in ("dispersion", "failure") if name in args}
+        for name in ("dispersion", "failure", "eval_seed", "eval_starts"):
+            if name in args:
+                flags[name.replace("_", "-")] = args[name]
         if args.get("navigation_noise"):
             flags["navigation-noise"] = " ".join(str(sigma) for sigma in args["navigation_noise"])
         command = [sys.executable, script, "--eval-only", "--no-cuda", *(f"--{name}={flags[name]}" for name in flags)]
@@ -399,6 +401,8 @@ def main():
         COMMANDS[args.command](args)
     except (ImportError, OSError, RuntimeError, ValueError) as error:
         sys.exit(f"evaluate.py: {error}")
+    except KeyboardInterrupt:
+        sys.exit(130)
 
 
 if __name__ == "__main__":

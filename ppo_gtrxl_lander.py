@@ -106,7 +106,7 @@ class Args:
     memory_noise: Schedule = 0.1  # std of the memory before an episode (Algorithm 1, line 5; the text says "small")
     reward_scale: float = 0.2  # factor on the rewards in training; losses are logged with it, returns without
 
-    # ours: off here, on in RECIPES
+    # ours: off here, or as in evaluations; on in RECIPES
     lr_times_std: bool = False  # the learning rate is --learning-rate times the policy's std
     flights_per_start: Schedule = 1  # flights of each draw, compared with one another
     fuel_weight: Schedule = 1.0  # reward lost for 100 kg of propellant in training
@@ -231,18 +231,19 @@ def set_curriculum(envs, args, progress):
     """Set what only training changes. Returns how many flights in a row have the same draw.
 
     The terminal reward tells errors apart only above its scales. Noise scatters flights in proportion to its std. So
-    the scales fall with the noise if --log-std is a schedule. They never fall below those of evaluations.
+    the scales fall with the noise if --log-std is a schedule, as in our recipe. They never fall below those of
+    evaluations. With a learned noise, as in the paper's recipe, the reward is that of evaluations.
     """
     if isinstance(args.log_std, str):
         std = math.exp(value_at(args.log_std, progress))
         envs.position_scale = max(30 * std, POSITION_SCALE)
         envs.speed_scale = max(10 * std, SPEED_SCALE)
+        envs.aloft_price = ALOFT_PRICE
+        envs.slope_height = SLOPE_HEIGHT
+        envs.sink_rate = SINK_RATE
     envs.fuel_price = value_at(args.fuel_weight, progress)
     envs.failed_fuel_share = args.failed_fuel_share
     envs.slope_price = value_at(args.slope_weight, progress)
-    envs.aloft_price = ALOFT_PRICE
-    envs.slope_height = SLOPE_HEIGHT
-    envs.sink_rate = SINK_RATE
     of_lander = LANDERS[args.env_id].failure_probability
     probability = of_lander if args.failure_probability is None else args.failure_probability
     envs.failure_probability = min(args.failure_emphasis * probability, 1.0)

@@ -192,8 +192,8 @@ def recipe(args):
     shipped = dict(FIRST_POLICY)
     if args.failure:
         shipped |= FIRST_OF_FAILING
-    first_policy = args.checkpoint or shipped.get(args.env_id)
-    if first_policy is None:
+    first_policy = shipped.get(args.env_id) if args.checkpoint is None else args.checkpoint
+    if not first_policy:
         flag = "--dispersion" if args.dispersion else "--failure"
         todo = f"train without {flag} first, and name that policy by --checkpoint"
         print(f"{flag}: no policy of {args.env_id} to begin with, so this training begins anew; better {todo}")

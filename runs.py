@@ -28,6 +28,7 @@ from pathlib import Path
 from typing import Annotated, Any, NoReturn, get_type_hints
 
 import gymnasium as gym
+import numpy as np
 import safetensors.torch
 import torch
 import torch.distributed as dist
@@ -213,7 +214,8 @@ def resolve(args, typed, kind, recipe, env_options, buffers):
         differing = contradictions(args, typed, its_own)
         if differing:
             flag = f"--{differing[0].replace('_', '-')} {getattr(args, differing[0])}"
-            print(f"{flag}: the recipe's first policy, {first}, has another; this training begins anew")
+            print(f"{flag}: the recipe's first policy, {first}, has another")
+            changes = recipe(replace(args, checkpoint=""))  # "": there is no policy to begin with
         else:
             args.checkpoint = first
             saved, decided = take_checkpoint_args(args, kind, typed, env_options, buffers)
@@ -335,14 +337,29 @@ def schedule_values(name, schedule):
     """The numbers that a schedule goes through. Ends with one line if it is no schedule."""
     if not isinstance(schedule, str):
         return [float(schedule)]
+    return schedule_points(name, schedule)[1]
+
+
+def schedule_points(name, schedule):
+    """The places and the values of a schedule's points. Ends with one line if it is no schedule."""
     try:
         points = [[float(word) for word in point.split(":")] for point in schedule.split()]
-        places, values = zip(*points)
-        if list(places) != sorted(places) or not all(0 <= place <= 1 for place in places):
+        places, values = zip(*points, strict=True)
+        if len(points[0]) != 2 or list(places) != sorted(places) or not all(0 <= place <= 1 for place in places):
             raise ValueError
     except ValueError:
         refuse(name, schedule, "must be a number, or points as 0:-1 0.4:-2 1:-6 whose places rise from 0 to 1")
-    return values
+    return places, values
+
+
+def group_sizes(args):
+    """The sizes of the groups of all updates, as `set_curriculum` of the scripts rounds them."""
+    schedule = args.flights_per_start
+    if not isinstance(schedule, str):
+        return {round(schedule)}
+    places, values = schedule_points("flights_per_start", schedule)
+    in_updates = np.interp(np.linspace(0, 1, args.total_updates), places, values)
+    return {round(size) for size in in_updates} | {round(value) for value in values}
 
 
 def check_outputs(args):
@@ -353,10 +370,12 @@ def check_outputs(args):
         if value is None:
             continue
         path = Path(value).resolve()
-        if not args.eval_only or path.is_dir() or not os.access(path.parent, os.W_OK):
-            refuse(name, value, "only with --eval-only, and must be a file in an existing, writable folder")
+        if not args.eval_only:
+            refuse(name, value, "only with --eval-only")
+        if path.is_dir() or not os.access(path.parent, os.W_OK):
+            refuse(name, value, "must be a file in an existing, writable folder")
         if path in taken:
-            refuse(name, value, "must be a file of its own, neither --checkpoint nor --eval-json")
+            refuse(name, value, "must be a file of its own; --checkpoint or the other of --eval-json and --eval-npz has it")
         taken.add(path)
 
 
@@ -404,13 +423,13 @@ def check_share(args, typed):
         args.num_minibatches = smallest
 
     shares = {smallest, largest}
-    groups = {int(group) for group in schedule_values("flights_per_start", args.flights_per_start)}
-    for group in groups:
+    for group in group_sizes(args):
         fits = largest_group(group, shares)
         if fits == group:
             continue
         if "flights_per_start" in typed:
-            refuse("flights_per_start", args.flights_per_start, f"must divide {total_envs}")
+            in_one = f"; it is {group} in one update" if isinstance(args.flights_per_start, str) else ""
+            refuse("flights_per_start", args.flights_per_start, f"must divide {total_envs}{in_one}")
         print(f"--flights-per-start lowered from {group} to {fits}, which divides {total_envs}")
         if isinstance(args.flights_per_start, str):
             args.flights_per_start = re.sub(rf":{group}\b", f":{fits}", args.flights_per_start)

@@ -36,7 +36,7 @@ def write_csv(path, curve: dict):
 
 def cell(value: float) -> str:
     """A number as text. A whole number is exact. Another has six digits, which are enough to draw the same curve."""
-    return f"{value:.0f}" if value == round(value) else f"{value:.6g}"
+    return f"{value:.0f}" if value.is_integer() else f"{value:.6g}"
 
 
 def evaluated(curve: dict) -> dict:

@@ -60,7 +60,7 @@ def check_numbers(problem):
         refuse(problem, possible, name, value, one_or_each)
     if problem.u_min is None:
         refuse(
-            problem, all(np.atleast_1d(u_max) > 0), "u_max", u_max, "must be positive, without u_min in each control"
+            problem, all(np.atleast_1d(u_max) > 0), "u_max", u_max, "each number must be positive if u_min is not given"
         )
     else:
         alike = np.shape(problem.u_min) == np.shape(u_max)
@@ -194,6 +194,8 @@ def try_functions(problem):
     x, u = tuple(read_only(x)), problem.as_control(read_only(u))
     if problem.guess is not None:
         controls = attempt(problem, "guess", problem.guess, x)
+        if isinstance(problem.u_max, tuple):
+            check_size(problem, "guess", controls, problem.controls, "control")
         as_rows(problem, "guess", controls if isinstance(problem.u_max, tuple) else (controls,))
     for k, phase in enumerate(problem.phases, start=1):
         f = problem.with_parameters(phase.f or problem.f, p)
@@ -249,10 +251,10 @@ def attempt(problem, field: str, function: Callable, *arguments):
         raise BadInput(f"{field} of {problem.env_id} fails: {why}") from error
 
 
-def check_size(problem, field: str, values, count: int):
-    """Raise BadInput unless a function returned a tuple of `count` values."""
+def check_size(problem, field: str, values, count: int, of: str = "state"):
+    """Raise BadInput unless a function returned a tuple of `count` values, one for each state or control (`of`)."""
     if not isinstance(values, tuple):
-        allowed = f"must be a tuple of {count}, one for each state (write the components of a matrix product)"
+        allowed = f"must be a tuple of {count}, one for each {of} (write the components of a matrix product)"
         refuse(problem, False, f"what {field} returns", f"a {type(values).__name__}", allowed)
     refuse(problem, len(values) == count, f"the number of what {field} returns", len(values), f"must be {count}")
 

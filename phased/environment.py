@@ -461,7 +461,7 @@ def register_problem(problem: Problem):
 def fly(env_id: str, policy: Callable, x0, draw=None, **options) -> dict:
     """Fly `policy(obs (n, obs), t) -> action (n, m)` from each start x0 (n, states), and record the flights.
 
-    draw (n, k) are the standard scores, if the table has any. Returns x (n, T+1, states), the applied (clipped) u
+    draw (n, k) are the standard scores, if the table has any; all 0 unless given. Returns x (n, T+1, states), the applied (clipped) u
     (n, T), or (n, T, m) if the table has a tuple of controls, reward (n, T), and the arrays of `final_info`. After an
     episode's end x and u are NaN, and rewards are 0.
     """
@@ -473,8 +473,10 @@ def fly(env_id: str, policy: Callable, x0, draw=None, **options) -> dict:
     reward = np.zeros((n, T))
     final_info = {}
     alive = np.ones(n, dtype=bool)
-    has_draw = problem.scores and draw is not None
-    obs, _ = batch.reset(options={"x0": x0, "draw": draw} if has_draw else {"x0": x0})
+    options = {"x0": x0}
+    if problem.scores:
+        options["draw"] = np.zeros((n, problem.scores)) if draw is None else draw
+    obs, _ = batch.reset(options=options)
     x[:, 0] = np.column_stack(batch.x)  # not from obs, where the velocity may be hidden
     for t in range(T):
         obs, rewards, ended, final = batch.advance(policy(obs, t))

@@ -148,13 +148,12 @@ def add_circle(problem: Problem, phase: Phase, plane, zorder: int = 3):
 
 def add_legend(figure: Figure, problem: Problem):
     """One legend for all panels, below them."""
-    radius = problem.phases[0].radius
-    handles = [
-        Line2D([], [], **POLICY, label="policy"),
-        Line2D([], [], **OPTIMUM, label="optimum"),
-        Line2D([], [], **TARGET, linestyle="--", marker="o", fillstyle="none", label=f"target (radius {radius})"),
-        Line2D([], [], color="k", marker=".", linestyle="", label="start"),
-    ]
+    handles = [Line2D([], [], **POLICY, label="policy"), Line2D([], [], **OPTIMUM, label="optimum")]
+    radii = dict.fromkeys(str(phase.radius) for phase in problem.phases if phase.has_circle)
+    if radii:
+        label = f"target (radius {', '.join(radii)})"
+        handles.append(Line2D([], [], **TARGET, linestyle="--", marker="o", fillstyle="none", label=label))
+    handles.append(Line2D([], [], color="k", marker=".", linestyle="", label="start"))
     if problem.waypoints:
         handles.append(Line2D([], [], **BOUNDARY, label="end of a phase"))
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))

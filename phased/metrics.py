@@ -9,7 +9,7 @@ import numpy as np
 
 from phased.problem import Problem
 
-PAPER_STARTS, PAPER_DRAWS = 10, 100  # the paper reports the mean ratio of ten starts; we draw ten starts 100 times
+PAPER_STARTS, PAPER_SAMPLES = 10, 100  # the paper reports the mean ratio of ten starts; we draw ten starts 100 times
 NEAR_ORIGIN = 0.2  # for smaller |x0|, J* is so small that the loss J - J* says more than the ratio
 
 
@@ -60,7 +60,7 @@ def comparable(problem: Problem, x: np.ndarray, x_reference: np.ndarray) -> np.n
 def ratio_metrics(cost: np.ndarray, reference_cost: np.ndarray, eval_seed: int) -> dict:
     """Statistics of the cost ratios, policy over optimum, of the m comparable starts. Without a start there is no key.
 
-    The paper's number is the mean of ten ratios. `ratio_mean` is its expectation, and the draws of ten show its spread.
+    The paper's number is the mean of ten ratios. `ratio_mean` is its expectation, and samples of ten starts show its spread.
     If the optimum's cost is below 0 (a gain), the ratio is 1 + loss / |gain|, so that above 1 is worse, as everywhere.
     A start whose optimum costs nothing has no ratio.
     """
@@ -74,7 +74,7 @@ def ratio_metrics(cost: np.ndarray, reference_cost: np.ndarray, eval_seed: int) 
     metrics |= {"ratio_min": ratio.min(), "ratio_max": ratio.max()}
     if len(ratio) >= PAPER_STARTS:
         rng = np.random.default_rng([eval_seed, 1])  # another stream than that of the starts
-        means = [rng.choice(ratio, PAPER_STARTS, replace=False).mean() for _ in range(PAPER_DRAWS)]
+        means = [rng.choice(ratio, PAPER_STARTS, replace=False).mean() for _ in range(PAPER_SAMPLES)]
         for percentile in (5, 50, 95):
             metrics[f"ten_start_ratio_mean_p{percentile:02d}"] = np.percentile(means, percentile)
     return {key: float(value) for key, value in metrics.items()}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from phased.metrics import NEAR_ORIGIN, PAPER_DRAWS, ends_at_origin
+from phased.metrics import NEAR_ORIGIN, PAPER_SAMPLES, ends_at_origin
 from phased.problem import Problem
 
 
@@ -74,7 +74,7 @@ def ratio_lines(problem: Problem, metrics: dict) -> list[str]:
     draws = {key: metrics.get(f"ten_start_ratio_mean_{key}") for key in ("p05", "p50", "p95")}
     if None not in draws.values():  # fewer than ten starts, or an older eval.json
         interval = f"{draws['p05']:.4f} to {draws['p95']:.4f} (5 % to 95 %), median {draws['p50']:.4f}"
-        lines.append(f"      {PAPER_DRAWS} draws of ten: {interval}")
+        lines.append(f"      {PAPER_SAMPLES} samples of ten: {interval}")
     if ends_at_origin(problem):
         lines.append("      dominated by starts near the origin, where the optimal cost J* vanishes")
     lines.append(f"    ratio of sums {metrics['ratio_of_sums']:.4f}")

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import shutil
+import types
 from pathlib import Path
 
 import numpy as np
@@ -56,3 +57,17 @@ def test_a_shorter_policy_is_flown_anew(tmp_path, monkeypatch):
     assert 1e-6 < metrics["error_norm"] < 0.01 and metrics["success"]
     assert (shorter / "eval.npz").exists()
     assert {path.name for path in run.iterdir()} == {"agent.safetensors", "bfloat16"}
+
+
+def test_a_shorter_policy_flies_the_starts_of_its_run(tmp_path, monkeypatch):
+    run = tmp_path / "run"
+    run.mkdir()
+    shutil.copy(ROOT / "results" / "rocket_cutoff" / "agent.safetensors", run)
+    held_out = lambda *words, **flag: {"args": {"eval_seed": 273427, "eval_starts": 7}}  # noqa: E731
+    monkeypatch.setattr(evaluate, "read_checkpoint", held_out)
+    flown = []
+    refused = types.SimpleNamespace(returncode=1, stderr="not flown")
+    monkeypatch.setattr(evaluate.subprocess, "run", lambda command, **streams: flown.extend(command) or refused)
+    with pytest.raises(ValueError, match="not flown"):
+        evaluate.shorten(run)
+    assert "--eval-seed=273427" in flown and "--eval-starts=7" in flown

@@ -16,7 +16,7 @@ import baselines
 import envs
 import evaluate
 from common import files
-from common.curves import evaluated, read_csv, read_curve, write_csv
+from common.curves import cell, evaluated, read_csv, read_curve, write_csv
 from common.files import write_json, write_npz
 from drawing import animation
 from drawing.training import median_curve
@@ -365,10 +365,10 @@ def test_table_of_an_older_evaluation_and_of_waypoints():
     metrics, _ = evaluate.evaluate(SINGLE, feedback(SINGLE, 20.0, 2.0), 5, 20, reference_flight(SINGLE, 5, 20))
     older = {key: value for key, value in metrics.items() if key not in NEAR | {"ten_start_ratio_mean_p05"}}
     text = table_of(older)
-    assert "draws of ten" not in text and "of the origin" not in text and f"mean {metrics['ratio_mean']:.4f}" in text
+    assert "samples of ten" not in text and "of the origin" not in text and f"mean {metrics['ratio_mean']:.4f}" in text
     metrics, _ = evaluate.evaluate(WAYPOINTS, feedback(WAYPOINTS, 1e3), 5, 20, reference_flight(WAYPOINTS, 5, 20))
     text = table_of(metrics)
-    assert "near the origin" not in text and "draws of ten" in text
+    assert "near the origin" not in text and "samples of ten" in text
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), np.float64("nan")])
@@ -422,6 +422,7 @@ def test_curve_of_a_resumed_run_keeps_the_last_value(tmp_path):
     assert path.read_text().startswith("global_step,")
     again = read_csv(path)
     assert again.keys() == curve.keys()
+    assert [cell(value) for value in (np.nan, np.inf, 3.0)] == ["nan", "inf", "3"]
     for tag, (steps, values) in curve.items():
         assert np.array_equal(again[tag][0], steps)
         assert again[tag][1] == pytest.approx(values, rel=5e-6)

@@ -176,6 +176,17 @@ def test_the_set_of_controls(new_problem):
         assert flight["u"][0, 0] == pytest.approx(applied)
 
 
+def test_two_controls_with_the_papers_costs(new_problem):
+    """Two masses without a limit in reach: LQR is the optimum, and collocation comes close to it."""
+    phase = Phase(steps=20, target=(0.0, 0.0), R=(0.1, 0.1), Qf=10.0)
+    problem = Problem("Pair-v0", lambda x, u: (u[0], -x[1] + u[1]), (50.0, 50.0), (phase,), (9.0, 9.0))
+    x0 = np.array([[0.5, -0.2], [-0.1, 0.9]])
+    env_id = new_problem(problem)
+    numbers = baselines.compare_single_phase(env_id, x0, baselines.reference(env_id, x0))
+    assert numbers["lqr_ratio_of_sums"] == pytest.approx(1.0, abs=1e-4)
+    assert numbers["collocation_flown_ratio_of_sums"] == pytest.approx(1.0, abs=0.05)
+
+
 def drawn(env_id):
     """A wind that is drawn and hidden, and a start that depends on the same scores."""
     return Problem(
@@ -195,6 +206,7 @@ def test_hidden_parameters_are_drawn(new_problem):
     z = np.array([[1.0, 0.0], [-2.0, 1.0]])
     x0 = np.column_stack([1.0 + 0.1 * z[:, 1], np.zeros(2)])
     flight = fly(env_id, hold(0.0), x0, z)
+    np.testing.assert_array_equal(fly(env_id, hold(0.0), x0)["draw"], 0 * z)  # without scores the nominal flight
     wind = 0.5 * z[:, 0]
     np.testing.assert_allclose(flight["x"][:, -1, 0], x0[:, 0] + wind * 0.5**2 / 2, rtol=1e-12)
     np.testing.assert_allclose(flight["cost_running"], 0.5 * wind**2, rtol=1e-12)
@@ -462,6 +474,10 @@ SLIPS = {
     "four states": ({"f": lambda x, u: (x[2], x[3], u, u), "x_max": (10.0,) * 4}, "target of phase 1"),
     "one derivative": ({"f": lambda x, u: (x[1],)}, "the number of what f returns"),
     "no tuple": ({"f": lambda x, u: x[1]}, "what f returns"),
+    "one guess for two controls": (
+        {"f": lambda x, u: (x[1], u[0] + u[1]), "u_max": (1.0, 1.0), "guess": lambda x: (-x[0],)},
+        "the number of what guess returns",
+    ),
     "matrix": ({"f": lambda x, u: np.array([[0, 1], [-1, 0]]) @ np.array(x) + np.array([0, 1]) * u}, "f of .*matrix"),
     "math.sin": ({"f": lambda x, u: (x[1], -math.sin(x[0]) + u)}, "f of .* NumPy's, as np.sin"),
     "max": ({"f": lambda x, u: (x[1], max(u, -x[0]))}, "f of .* decides by a value"),

@@ -229,8 +229,11 @@ def test_a_dispersed_training_begins_with_the_shipped_policy(monkeypatch, capsys
     assert args.checkpoint == "results/rocket_cutoff/agent.safetensors" and args.log_std == "0:-3.5 1:-6.5"
     failing = dispersed("--failure=0.25")
     assert failing.checkpoint == "results/rocket_dispersed/agent.safetensors" and failing.total_updates == 150
-    assert dispersed("--embed-dim=8").checkpoint is None
-    assert re.match("--embed-dim 8: .*results/rocket_cutoff.* begins anew", capsys.readouterr().out)
+    anew = dispersed("--embed-dim=8")
+    assert anew.checkpoint is None and anew.num_envs == 64
+    assert anew.log_std == ROCKET.RECIPES["RocketAscentCutoff-v0"]["log_std"]  # not that of a trained policy
+    said = capsys.readouterr().out
+    assert re.match("--embed-dim 8: .*results/rocket_cutoff.* has another\n.* begins anew", said)
     assert dispersed("--recipe=paper").checkpoint is None
     monkeypatch.chdir(tmp_path)
     assert dispersed().checkpoint == str(ROOT / "results/rocket_cutoff/agent.safetensors")
@@ -1074,10 +1077,13 @@ FLOWN = ["--eval-only", "--checkpoint", ROOT / "results" / "di" / "agent.safeten
         (["--num-envs", 4, "--num_minibatches=8"], "--num-minibatches 8: must be at most --num-envs 4"),
         (["--num-envs", 80, "--flights-per-start", 3], "--flights-per-start 3: must divide --num-envs 80"),
         (["--num-envs", 4, "--flights-per-start=8"], "--flights-per-start 8: must divide --num-envs 4"),
+        (["--num-envs", 8, "--flights-per-start", "0:1", "1:4"], "must divide --num-envs 8; it is 3 in one update"),
+        (["--log-std", "0:-1", "0.4:-2:-7"], "--log-std 0:-1 0.4:-2:-7: must be a number, or points as"),
+        (["--log-std", "0:-1:-2", "0.4:-2:-7"], "--log-std 0:-1:-2 0.4:-2:-7: must be a number, or points as"),
         (["--eval-only"], "--checkpoint"),
         (["--eval-json", "a.json"], "--eval-json a.json: only with --eval-only"),
         (["--eval-npz", "a.npz"], "--eval-npz a.npz: only with --eval-only"),
-        ([*FLOWN, "--eval-json", "."], "--eval-json .: only with --eval-only, and must be a file in an existing"),
+        ([*FLOWN, "--eval-json", "."], "--eval-json .: must be a file in an existing"),
         ([*FLOWN, "--eval-json=a.x", "--eval-npz=a.x"], "--eval-npz a.x: must be a file of its own"),
         ([*FLOWN, "--eval-json", FLOWN[-1]], "agent.safetensors: must be a file of its own"),
     ],
