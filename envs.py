@@ -94,13 +94,13 @@ __all__ = [  # what users import from here
 
 
 def double_integrator(x, u):
-    """Position and velocity driven by an acceleration: x1' = x2, x2' = u ("Double Integrator Problem")."""
+    """Position and velocity driven by an acceleration: x1' = x2, x2' = u (Eq. (13))."""
     _, x2 = x
     return x2, u
 
 
 def van_der_pol(x, u, epsilon=0.1):
-    """Van der Pol oscillator: x1' = x2, x2' = -x1 + epsilon (1 - x1^2) x2 + u ("Van der Pol Oscillator Problem")."""
+    """Van der Pol oscillator: x1' = x2, x2' = -x1 + epsilon (1 - x1^2) x2 + u (Eq. (16))."""
     x1, x2 = x
     return x2, -x1 + epsilon * (1 - x1 * x1) * x2 + u
 

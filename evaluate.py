@@ -76,7 +76,7 @@ def publish(run_dir, folder, ship: bool = False, numbers: bool = False):
     for path in [*folder.glob("eval.json"), *(folder / "seeds").glob("*.json")]:
         other = read_json(path)["env_id"]
         if other != metrics["env_id"]:
-            raise ValueError(f"{run_dir} is of {metrics['env_id']}, {path} of {other}")
+            raise ValueError(f"env_id of {run_dir} is {metrics['env_id']}; it must be {other}, as in {path}")
     if shipped and not ship and shipped["seed"] == metrics["seed"]:
         raise ValueError(f"{folder} already ships seed {metrics['seed']}; --ship replaces it")
     seed = metrics["seed"]
@@ -310,7 +310,7 @@ def export_command(args):
     if not targets:
         raise BadInput(f"nothing to export: name a file by {', '.join(f'--{name}' for name in FORMATS)}")
     if len({path.resolve() for path in targets.values()}) < len(targets):
-        raise BadInput("two of the files are one: each must have a name of its own")
+        raise BadInput("two of the flags name one file: each must have a file of its own")
     export(args.folder, targets, args.epoch, args.launch_longitude)
     for path in targets.values():
         print(path)

@@ -8,10 +8,13 @@
 Reading order: arguments, recipes, problem, Gated Transformer-XL, agent, PPO, what we add to PPO, training, main.
 From the first section "Shared" on, all ppo_gtrxl_*.py are the same to the letter. A section with "ours" in its heading
 contains nothing from the paper. In the other sections a comment marks what is ours. "Line 8" means line 8 of
-Algorithm 1.
+Algorithm 1, "Eq. (7)" the seventh numbered equation of the paper.
 
 T is the number of steps, N of environments, H of heads. L is the memory length, d the width, and dk = d / H.
 Algorithm 1 writes E for our N, and N for its iterations.
+
+The dynamics are Eq. (13), the cost J is Eq. (14), the reward r_t Eq. (15). With waypoints the observation o_t is
+Eq. (19). The problems' tables are in envs.py, cost, reward and observation in phased/environment.py.
 """
 
 from __future__ import annotations
@@ -216,7 +219,7 @@ def linear(inputs, outputs, gain=1.0, bias=0.0):
 
 
 class Gate(nn.Module):
-    """gate(x, y) = lambda x + (1 - lambda) y, lambda = sigmoid(W_g [x, y] + b_g), of x and y (..., d).
+    """Eq. (7): gate(x, y) = lambda x + (1 - lambda) y, lambda = sigmoid(W_g [x, y] + b_g), of x and y (..., d).
 
     With b_g > 0 an untrained gate is near the identity gate(x, y) = x.
     """
@@ -231,9 +234,10 @@ class Gate(nn.Module):
 
 
 class RelativeAttention(nn.Module):
-    """Multi-head attention over a sliding window: A_ij = (x_i W^Q) (x_j W^K + R_{i-j})^T / sqrt(d_k), i - L <= j <= i.
+    """Multi-head attention over a sliding window, i - L <= j <= i, with the scores of Eq. (10).
 
-    j runs over the memory and the episode. R is learned. It has one vector for each head and each distance 0 to L.
+    A_ij = (x_i W^Q) (x_j W^K + R_{i-j})^T / sqrt(d_k), and j runs over the memory and the episode. R is learned. It has
+    one vector for each head and each distance 0 to L.
     """
 
     def __init__(self, embed_dim, num_heads, memory_length):
@@ -321,7 +325,7 @@ class RelativeAttention(nn.Module):
 
 
 class GTrXLBlock(nn.Module):
-    """h1 = gate(x, LayerNorm(x + MultiHead(x))), h2 = gate(h1, LayerNorm(h1 + MLP(h1)))."""
+    """h1 = gate(x, LayerNorm(x + MultiHead(x))), h2 = gate(h1, LayerNorm(h1 + MLP(h1))): Eq. (8) and (9)."""
 
     def __init__(self, embed_dim, num_heads, memory_length, mlp_dim):
         super().__init__()
@@ -492,7 +496,7 @@ def rollout(agent, envs, reward_scale, memory_noise):
         hidden[t], batch.actions[t] = agent.act(batch.obs[t], cache, t)  # lines 7, 8 and 10
         # line 9. The end of an episode is a true end, where V is 0: nothing is ever truncated.
         next_obs, reward, terminated, _, info = envs.step(batch.actions[t].cpu().numpy())
-        rewards[t] = reward * alive * reward_scale
+        rewards[t] = reward * alive * reward_scale  # line 11
         ended = alive & terminated
         for key, value in info.get("final_info", {}).items():
             first_episodes = episodes.setdefault(key, np.zeros_like(value))
@@ -511,7 +515,7 @@ def rollout(agent, envs, reward_scale, memory_noise):
 
 
 def gae(rewards, values, alive, gamma, gae_lambda):
-    """Advantages A_t = sum_l (gamma lambda)^l delta_{t+l} and returns A_t + V_t, all (T, N).
+    """Advantages A_t = sum_l (gamma lambda)^l delta_{t+l}, Eq. (12), and returns A_t + V_t, all (T, N).
 
     delta_t = r_t + gamma V_{t+1} - V_t, where V is 0 beyond an episode's end.
     """
@@ -546,9 +550,9 @@ def explained_variance(prediction, returns, alive):
 def ppo_loss(agent, batch, mb, clip_coef, vf_coef, ent_coef):
     """The loss -L_CLIP + c1 L_VF - c2 H over the living steps of the episodes `mb`, and the means that are logged.
 
-    The paper prints L_CLIP + c1 L_VF - c2 H. Our sign of L_CLIP raises it where the loss is minimised. L_VF is
-    1/2 (critic - target)^2. Under torchrun the loss is this process's part of the mean, and `ppo_gradient` sums the
-    gradients. What is logged is the mean over all processes.
+    L_CLIP is Eq. (11). Line 18 prints L_CLIP + c1 L_VF - c2 H. Our sign of L_CLIP raises it where the loss is
+    minimised. L_VF is 1/2 (critic - target)^2. Under torchrun the loss is this process's part of the mean, and
+    `ppo_gradient` sums the gradients. What is logged is the mean over all processes.
     """
     alive = batch.alive[:, mb]
     advantages = batch.advantages[:, mb]
@@ -753,7 +757,7 @@ def main(argv):
     device = runs.prepare_torch(args)
     env_options = {name: getattr(args, name) for name in ENV_OPTIONS} | FIXED_OPTIONS
     envs = runs.make_envs(args, env_options)
-    agent = Agent(args, envs).to(device)
+    agent = Agent(args, envs).to(device)  # line 1
     runs.load_checkpoint(agent, args, saved)
     before_training(agent, args, env_options)
     average = AveragedModel(agent, multi_avg_fn=get_ema_multi_avg_fn(args.weight_average))

@@ -375,7 +375,7 @@ def check_outputs(args):
         if path.is_dir() or not os.access(path.parent, os.W_OK):
             refuse(name, value, "must be a file in an existing, writable folder")
         if path in taken:
-            refuse(name, value, "must be a file of its own; --checkpoint or the other of --eval-json and --eval-npz has it")
+            refuse(name, value, "must be a file of its own; another flag names it, too")
         taken.add(path)
 
 

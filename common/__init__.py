@@ -1,1 +1,1 @@
-"""The ground: what every family and every command stands on. Nothing here knows a problem."""
+"""The ground: what every family and every command stands on. Nothing here knows the equations of a problem."""

@@ -52,7 +52,8 @@ def read_json(path: Path) -> dict:
     except ValueError as error:
         raise ValueError(f"{path} is not readable JSON: {error}") from error
     if not isinstance(metrics, dict) or metrics.get("env_id") not in env_ids():
-        raise ValueError(f"{path}: env_id must be one of {', '.join(env_ids())}")
+        found = metrics.get("env_id") if isinstance(metrics, dict) else type(metrics).__name__
+        raise ValueError(f"{path}: env_id is {found!r}; it must be one of {', '.join(env_ids())}")
     if not isinstance(metrics.get("seed"), int):
         raise ValueError(f"{path}: seed is {metrics.get('seed')!r}; it must be an integer")
     return metrics

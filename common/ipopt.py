@@ -10,7 +10,8 @@ from contextlib import contextmanager
 
 PATIENCE = 5.0  # s until the line is printed
 LEAST = 0.1  # s; less time counts as none, because IPOPT refuses a limit of 0
-limit = {"seconds": 120.0}  # for all tries of a solve; `python baselines.py ID --solve-seconds` sets it
+# Of a rocket for all tries of a solve, else for each one. `python baselines.py ID --solve-seconds` sets it.
+limit = {"seconds": 120.0}
 
 
 class SolveClock:

@@ -346,7 +346,7 @@ def published_touchdown(arc: Arc, lander: Lander):
 
 
 class LanderEnv(SingleEnv):
-    """One flight of `LanderVectorEnv`, with the batch's public attributes."""
+    """One flight of `LanderVectorEnv`, with those of the batch's attributes that are named below."""
 
     position_scale = of_batch("position_scale", "Scale (m) of the position error in the terminal reward.")
     speed_scale = of_batch("speed_scale", "Scale (m/s) of the speed in the terminal reward.")

@@ -121,7 +121,7 @@ def check_rows(problem, n: int, n_states: str):
         refuse(problem, possible, name, names, f"must be a tuple of words, {count}: one for each {each} has {count})")
     hidden = problem.velocities
     possible = hidden is None or is_tuple_of(lambda k: isinstance(k, int) and 0 <= k < n, hidden)
-    refuse(problem, possible, "velocities", hidden, f"must be numbers of states, 0 to {n - 1}")
+    refuse(problem, possible, "velocities", hidden, f"must be a tuple of the states' indices, from 0 to {n - 1}")
     bounds = problem.bounds
     if bounds is not None:
         possible = is_tuple_of(is_bound, bounds) and len(bounds) == n

@@ -23,17 +23,18 @@ TRANSITION_STEPS = 5
 class PhasedVectorEnv(BatchedEnv):
     """N copies of a `Problem`: the double integrator and Van der Pol families, and problems of a user's own.
 
-    Observation: with several phases the paper's o_t = [x1, x2, x1_target, x2_target, tau, phi], with one phase
+    Observation: with several phases the paper's o_t, Eq. (19), [x1, x2, x1_target, x2_target, tau, phi], with one phase
     [x1, x2, tau], which is our choice. tau = t / T, and phi is the 0-based phase over (phases - 1). The observed target
     moves to a new waypoint over the first `TRANSITION_STEPS` of its phase.
 
     Action: u, clipped to the set of controls. A vector whose norm has a lower bound keeps its direction. A zero vector
     then points along the last axis.
 
-    Reward: the paper's r_t = -(dx'Q dx + R u^2), where dx is the distance to the phase's target before the step. A
-    phase's last step adds -Qf |dx|^2 + B 1[|dx| <= r] with dx after the step. So an episode's rewards sum to bonus - J.
-    The paper prints r_t for one phase and target 0. A reward for each phase is our extension, and so are the functions
-    and bounds of a table (`Problem`). The end of the horizon is `terminated`, because the time is observed.
+    Reward: the paper's r_t, Eq. (15) and (18), -(dx'Q dx + R u^2), where dx is the distance to the phase's target
+    before the step. A phase's last step adds -Qf |dx|^2 + B 1[|dx| <= r] with dx after the step. So an episode's
+    rewards sum to bonus - J. Eq. (6) multiplies the running cost by the length of a step; these two do not, and neither
+    do we. The paper prints r_t for one phase and target 0. A reward for each phase is our extension, and so are the
+    functions and bounds of a table (`Problem`). The end of the horizon is `terminated`, because the time is observed.
 
     If a phase ends by its event, the step ends at that moment, and its weights count in proportion to its length. The
     next phase begins at the same moment. With events tau is the time over the longest possible one.
@@ -461,9 +462,10 @@ def register_problem(problem: Problem):
 def fly(env_id: str, policy: Callable, x0, draw=None, **options) -> dict:
     """Fly `policy(obs (n, obs), t) -> action (n, m)` from each start x0 (n, states), and record the flights.
 
-    draw (n, k) are the standard scores, if the table has any; all 0 unless given. Returns x (n, T+1, states), the applied (clipped) u
-    (n, T), or (n, T, m) if the table has a tuple of controls, reward (n, T), and the arrays of `final_info`. After an
-    episode's end x and u are NaN, and rewards are 0.
+    draw (n, k) are the standard scores, if the table has any; all 0 unless given.
+
+    Returns x (n, T+1, states), the applied (clipped) u (n, T), or (n, T, m) if the table has a tuple of controls,
+    reward (n, T), and the arrays of `final_info`. After an episode's end x and u are NaN, and rewards are 0.
     """
     batch: Any = gym.make_vec(env_id, num_envs=len(x0), **options)  # a PhasedVectorEnv
     problem = batch.problem

@@ -60,7 +60,7 @@ def comparable(problem: Problem, x: np.ndarray, x_reference: np.ndarray) -> np.n
 def ratio_metrics(cost: np.ndarray, reference_cost: np.ndarray, eval_seed: int) -> dict:
     """Statistics of the cost ratios, policy over optimum, of the m comparable starts. Without a start there is no key.
 
-    The paper's number is the mean of ten ratios. `ratio_mean` is its expectation, and samples of ten starts show its spread.
+    The paper's number is the mean of ten ratios. `ratio_mean` is its expectation, and samples of ten show its spread.
     If the optimum's cost is below 0 (a gain), the ratio is 1 + loss / |gain|, so that above 1 is worse, as everywhere.
     A start whose optimum costs nothing has no ratio.
     """
@@ -106,12 +106,12 @@ def near_origin_metrics(problem: Problem, x0: np.ndarray, cost: np.ndarray, refe
 
 
 def cost_parts(problem: Problem, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """State, control and terminal part (n, 3) of the cost J of flights: the paper's Eq. of J.
+    """State, control and terminal part (n, 3) of the cost J of flights, Eq. (14) and (17).
 
     x (n, T+1, states), u (n, T) or (n, T, m).
 
-    eval.npz holds the flights and their total cost; the figures take its parts from here. Of costs by weights, without
-    events: those of functions are told in eval.json alone.
+    eval.npz holds the flights and their total cost; the figures take its parts from here. This is for costs by weights
+    without events. The parts of other costs are in eval.json alone.
     """
     u = u.reshape(len(u), -1, problem.controls)
     parts, start = np.zeros((len(x), 3)), 0

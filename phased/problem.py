@@ -87,8 +87,9 @@ class Problem:
     `x_scale` beyond them.
 
     `single_optimum` promises that IPOPT ends in the same optimum from every guess, so the reference tries one guess
-    (`baselines.guesses`). Without it the reference is the best of several. Raises BadInput for a table that cannot be
-    flown.
+    (`guesses` of phased/optimum.py). Without it the reference is the best of several.
+
+    Raises BadInput for a table that cannot be flown.
     """
 
     env_id: str

@@ -8,7 +8,7 @@ from rocket.vehicle import ROCKET, Rocket
 
 
 def ascent_dynamics(x, u, rocket: Rocket = ROCKET, wind=None, drag_factor=None):
-    """r' = v, v' = -mu r / |r|^3 + T u / m + D / m, m' = -flow ("Multiphase Rocket Ascent Problem").
+    """r' = v, v' = -mu r / |r|^3 + T u / m + D / m, m' = -flow (Eq. (20)).
 
     D = -1/2 rho Cd S |v_rel| v_rel, rho = rho0 exp(-h / H), v_rel = v - omega_e x r. The paper's drag acts "during
     atmospheric phases". This drag acts always, and fades with the density.

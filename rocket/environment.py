@@ -267,7 +267,7 @@ class RocketVectorEnv(BatchedEnv):
         if options.keys() - set(taken):
             allowed = "a rocket has none without dispersion, failure or navigation noise"
             if taken:
-                allowed = f"the only one is {taken[0]!r}" if len(taken) == 1 else "there are 'draw' and 'noise'"
+                allowed = f"the only one is {taken[0]!r}" if len(taken) == 1 else "they may be 'draw' and 'noise'"
             raise BadInput(f"reset options are {options!r}; {allowed}")
         if not 0 < self.terminal_scale < np.inf:
             raise ValueError(f"terminal_scale is {self.terminal_scale}; it must be positive and finite")
@@ -641,7 +641,7 @@ def reachable(rocket: Rocket, dispersion: float, end: float) -> tuple[float, flo
 
 
 class RocketEnv(SingleEnv):
-    """One flight of `RocketVectorEnv`, with the batch's public attributes."""
+    """One flight of `RocketVectorEnv`, with those of the batch's attributes that are named below."""
 
     mass_weight = of_batch("mass_weight", "Reward lost per `mass_unit` of propellant burnt in the last phase.")
     trajectory_weight = of_batch("trajectory_weight", "Weight of R_trajectory.")
@@ -719,7 +719,7 @@ def register_rocket(env_id: str, rocket: Rocket, cutoff: bool = False, ceiling_k
         raise BadInput(f"env_id is {env_id!r}; it must be a new id such as MyRocket-v0")
     names = [field.name for field in fields(Mission)]
     for name in rules.keys() - set(names):
-        raise BadInput(f"a keyword is {name!r}; it must be one of {', '.join(names)}")
+        raise BadInput(f"register_rocket has no keyword {name!r}; it must be one of {', '.join(names)}")
     mission = Mission(rocket, cutoff, ceiling_km, **rules)
     if ROCKETS.get(env_id, mission) != mission:
         warnings.warn(f"{env_id} was another rocket's id; from here on it is this one's", stacklevel=2)

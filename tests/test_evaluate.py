@@ -677,7 +677,7 @@ FAULTS = {
     "broken json": "not readable JSON",
     "other weights": "checkpoint_sha256",
     "other env": "VanDerPol-v0",
-    "unknown env": "env_id must be one of",
+    "unknown env": "it must be one of",
     "bad seed": "seed is '../1'",
     "shipped seed": "--ship",
 }

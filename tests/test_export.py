@@ -382,7 +382,7 @@ def test_czml_shows_the_flight(tmp_path):
             "evaluate.py: the evaluation of RocketAscent-v0 holds one flight; --flights",
         ),
         ("di", [], "evaluate.py: nothing to export: name a file by --onnx, --csv, --flights, --oem, --czml"),
-        ("di", ["--csv={}", "--flights={}"], "evaluate.py: two of the files are one"),
+        ("di", ["--csv={}", "--flights={}"], "evaluate.py: two of the flags name one file"),
         ("memory", ["--csv={}"], "evaluate.py: [Errno 2] No such file or directory"),
         ("memory", ["--onnx={}"], "evaluate.py: "),
         ("rocket_cutoff", ["--czml={}", "--epoch=tomorrow"], "error: argument --epoch: 'tomorrow' must be a moment"),

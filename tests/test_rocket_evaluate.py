@@ -603,7 +603,7 @@ def test_refused_publishing(flown, tmp_path, monkeypatch, capsys):
     metrics, arrays = flown[CUTOFF]
     bad = {"y_reference": make_run(tmp_path / "lacks", (metrics, {k: arrays[k] for k in ARRAYS - {"y_reference"}}), 2)}
     bad |= {FIXED: make_run(tmp_path / "other id", flown[FIXED], 2)}
-    bad |= {"env_id must be one of": make_run(tmp_path / "unknown", flown[CUTOFF], 2, env_id="RocketAscent-v9")}
+    bad |= {"it must be one of": make_run(tmp_path / "unknown", flown[CUTOFF], 2, env_id="RocketAscent-v9")}
     for message, run in bad.items():
         with pytest.raises(SystemExit) as refusal:
             command_line(monkeypatch, capsys, "publish", run, results)
