@@ -562,7 +562,7 @@ def test_seeds_alone_say_of_which_problem_a_folder_is(tmp_path):
     run, other = make_run(tmp_path / "a", seed=1), tmp_path / "results" / "seeds" / "2.json"
     other.parent.mkdir(parents=True)
     other.write_text(json.dumps({"env_id": "VanDerPol-v0", "seed": 2}))
-    with pytest.raises(ValueError, match="2.json of VanDerPol-v0"):
+    with pytest.raises(ValueError, match="it must be VanDerPol-v0, as in .*2.json"):
         evaluate.publish(run, tmp_path / "results", numbers=True)
     assert [path.name for path in other.parent.iterdir()] == ["2.json"]
 
