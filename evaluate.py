@@ -368,7 +368,8 @@ def parse_args(argv=None):
     command.add_argument("--failure", type=number(0, 0.3), default=0.0, metavar="K", help=lost)
     strikes = "when these strike: random (default) or ignition"
     command.add_argument("--failure-time", default="random", metavar="WHEN", help=strikes)
-    sigma, off = number(0, 1e4), "noise of what laws and policies see of position and velocity: default none"
+    sigma = number(0, 1e4)
+    off = "noise of what laws and policies see of position and velocity: default none"
     command.add_argument("--navigation-noise", nargs=2, type=sigma, metavar=("M", "M/S"), help=off)
     size = integer(10, 100_000)
     command.add_argument("--starts", type=size, metavar="N", help="flights (default: as many as an evaluation has)")

@@ -38,13 +38,15 @@ def episodes_of(arrays: dict, shown: int) -> list[Flight]:
 
 def labels_of(arrays: dict) -> list[str]:
     """A name for each observation and action."""
-    observations, actions = arrays["obs"].shape[2], arrays["u"].shape[2]
+    observations = arrays["obs"].shape[2]
+    actions = arrays["u"].shape[2]
     return [*(f"observation {k}" for k in range(observations)), *(f"action {k}" for k in range(actions))]
 
 
 def episodes_figure(arrays: dict, title: str, shown: int) -> Figure:
     """Each observation and each action of the first episodes over time."""
-    labels, flights = labels_of(arrays), episodes_of(arrays, shown)
+    labels = labels_of(arrays)
+    flights = episodes_of(arrays, shown)
     columns = min(3, len(labels))
     rows = -(-len(labels) // columns)
     figure = Figure(figsize=(4.2 * columns, 2.6 * rows + 0.6), layout="constrained")

@@ -50,7 +50,10 @@ def observations(agent, args, options, eval_seed):
     """One flight of the mean action: observations (T, obs), their times (T,) in s, and the begins of phases in s."""
     environment = gym.make_vec(args.env_id, num_envs=1, **options)
     obs, _ = environment.reset(options=task_of(args.env_id).reset_options(eval_seed, 1, **options))
-    policy, seen, phases, ended = agent.make_policy(environment.episode_steps), [], [], np.array([False])
+    policy = agent.make_policy(environment.episode_steps)
+    seen = []
+    phases = []
+    ended = np.array([False])
     while not ended.all():
         seen.append(obs[0])
         phases.append(environment.phase[0])
@@ -85,7 +88,8 @@ def weights(agent, obs):
 @torch.no_grad()
 def gates(agent, obs):
     """Mean and standard deviation of lambda (blocks, 2 gates, 2) over a flight's steps and the d components."""
-    seen, opened = [], [gate for block in agent.blocks for gate in (block.gate1, block.gate2)]
+    seen = []
+    opened = [gate for block in agent.blocks for gate in (block.gate1, block.gate2)]
     hooks = [gate.linear.register_forward_hook(lambda *passed: seen.append(passed[-1].sigmoid())) for gate in opened]
     agent.encode(torch.as_tensor(obs, dtype=agent.actor_logstd.dtype)[None], agent.new_memory(1, noise=0.0))
     for hook in hooks:

@@ -59,7 +59,8 @@ def compare(env_id: str, policies: dict, n: int = 1, seed: int = 0, **env_option
     envs = gym.make_vec(env_id, num_envs=n, **env_options)
     obs, _ = envs.reset(options=task_of(env_id).reset_options(seed, n, **env_options))
     alive = np.ones(n, dtype=bool)
-    actions, seconds = {name: [] for name in policies}, {name: [] for name in policies}
+    actions = {name: [] for name in policies}
+    seconds = {name: [] for name in policies}
     for t in range(envs.episode_steps):
         for name, policy in policies.items():
             begin = time.perf_counter()

@@ -42,7 +42,8 @@ def main():
     print(f"{'id':35} {'batch of ' + str(args.num_envs):>14} {'single':>10}   steps/s on one core")
     for env_id in env_ids():
         for label, options, action in task_of(env_id).speed_cases():
-            batch, single = gym.make_vec(env_id, num_envs=args.num_envs, **options), gym.make(env_id, **options)
+            batch = gym.make_vec(env_id, num_envs=args.num_envs, **options)
+            single = gym.make(env_id, **options)
             rates = []
             for env, steps in ((batch, args.num_envs), (single, 1)):
                 env.reset(seed=0)

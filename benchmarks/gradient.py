@@ -108,7 +108,8 @@ def legs_of(env, T: int) -> list[Leg]:
         dropped = torch.tensor(vehicles.dropped[arc, who] * is_met)
         numbers = map(torch.tensor, (until - at, vehicles.thrust[arc, who], vehicles.flow[arc, who]))
         legs.append(Leg(*numbers, F.pad(dropped[..., None], (6, 0)), is_met.any(axis=1)))
-        at, arc = until, np.minimum(arc + is_met, len(vehicles.end) - 1)
+        at = until
+        arc = np.minimum(arc + is_met, len(vehicles.end) - 1)
     return legs
 
 
@@ -148,7 +149,9 @@ class Physics:
         continued by up to `SPARE` seconds, since only a cut-off has a derivative of the mass.
         """
         seconds, thrust, flow = (column[last, torch.arange(len(y))] for column in self.legs[0][:3])
-        mu, controls, longest = self.rocket.mu, (*u.unbind(dim=-1), thrust, flow), seconds + SPARE
+        mu = self.rocket.mu
+        controls = (*u.unbind(dim=-1), thrust, flow)
+        longest = seconds + SPARE
         for _ in range(6):
             x = self.burn(y, u, seconds, thrust, flow).unbind(dim=-1)
             rx, ry, rz, vx, vy, vz, _ = x
@@ -232,7 +235,9 @@ def derivative(agent, env, flights: Flights):
 def unrolled(agent, physics: Physics, flights: Flights):
     """`derivative` for any policy: fly once more in torch, step by step, and let autograd go back."""
     T, n = flights.y.shape[:2]
-    states, flown, cache = [flights.y[0]], [], empty_cache(agent, n)
+    states = [flights.y[0]]
+    flown = []
+    cache = empty_cache(agent, n)
     for t in range(T):
         flown.append(directions(agent, physics, states[t], flights.shown[t], cache, t))
         states.append(physics.advance(np.array([t]), states[t][None], flown[t][None])[0])
@@ -287,7 +292,8 @@ def adjoint(agent, physics: Physics, flights: Flights):
     A, B = by_rows(physics.advance(np.arange(T), y, u), [y, u])
     (K,) = by_rows(directions(agent, physics, y, flights.shown, [], 0), [y])
     ends = flights.last, torch.arange(n)
-    y_last, u_last = y.detach()[ends].requires_grad_(), u.detach()[ends].requires_grad_()
+    y_last = y.detach()[ends].requires_grad_()
+    u_last = u.detach()[ends].requires_grad_()
     outcome = physics.outcome(flights.last, y_last, u_last)
     by_y, by_u = by_rows(outcome, [y_last, u_last])
 
@@ -342,7 +348,9 @@ class Curve:
     """Twenty points of a training: flights and minutes of the processor until then, and what was measured."""
 
     def __init__(self):
-        self.points, self.flights, self.began = [], 0, time.process_time()
+        self.points = []
+        self.flights = 0
+        self.began = time.process_time()
 
     def add(self, recipe: Recipe, update: int, **measured):
         """Count an update. It is a point if it is a twentieth, or the last."""
@@ -387,7 +395,9 @@ def train_rocket(agent, env, recipe: Recipe, curve: Curve):
             curve.add(recipe, update)
             continue
         outcome, J = derivative(agent, env, flights)
-        error, J_error, J_mass = outcome[:, :6], J[:, :6].flatten(0, 1), J[:, 6].mean(dim=0)
+        error = outcome[:, :6]
+        J_error = J[:, :6].flatten(0, 1)
+        J_mass = J[:, 6].mean(dim=0)
         missed = error.norm(dim=1)  # (n,)
         is_near = missed.max() < NEAR
 
@@ -480,7 +490,8 @@ def make_envs(row: Row, n: int, seed: int):
 
 def new_agent(row: Row, seed: int):
     """A script's agent, without blocks unless the row has a memory, and its arguments."""
-    script, args = row.script, row.script.Args(env_id=row.env_id, seed=seed)
+    script = row.script
+    args = row.script.Args(env_id=row.env_id, seed=seed)
     for name, value in script.recipe(args).items():
         setattr(args, name, value)
     if not row.has_memory:
@@ -506,7 +517,8 @@ def train(name: str, seed: int, curve: Curve):
 
 def evaluated(row: Row, agent) -> dict:
     """The metrics of the mean action in float32, on the flights on which every other row is evaluated."""
-    task, (env, options) = task_of(row.env_id), make_envs(row, 1, 1)
+    task = task_of(row.env_id)
+    (env, options) = make_envs(row, 1, 1)
     policy = agent.float().make_policy(env.episode_steps)
     n = task.default_flights(is_brief=False, **options)
     metrics, _ = evaluate.evaluate(row.env_id, policy, 0, n, **options)
@@ -569,11 +581,14 @@ def ppo_runs(row: Row) -> list[dict]:
 
     A dispersed training counts the shipped one of the nominal flight, with which each seed began.
     """
-    folder, flights, seconds = ROOT / "results" / row.result, 0, 0.0
+    folder = ROOT / "results" / row.result
+    flights = 0
+    seconds = 0.0
     if row.start:
         before = ROOT / "results" / ROWS[row.start].result
         shipped = read_json(before / "eval.json")
-        flights, seconds = ppo_flights(before, shipped), shipped["wall_seconds"]
+        flights = ppo_flights(before, shipped)
+        seconds = shipped["wall_seconds"]
     runs = []
     for path in sorted((folder / "seeds").glob("*.json")):
         run = read_json(path)

@@ -49,7 +49,8 @@ def last_weights_flown(run: Path) -> dict:
         raise BadInput(f"{run} must hold a run's training_state.pt ({error})") from error
     with tempfile.TemporaryDirectory() as folder:
         runs.save_run(Path(folder), state)
-        weights, found = Path(folder) / "agent.safetensors", Path(folder) / "eval.json"
+        weights = Path(folder) / "agent.safetensors"
+        found = Path(folder) / "eval.json"
         try:
             evaluate_by_script(script_of(weights), weights, flags | {"eval-json": found})
         except BadInput as error:
@@ -59,7 +60,8 @@ def last_weights_flown(run: Path) -> dict:
 
 def table(run: Path) -> list[str]:
     """The lines of a run: averaged weights beside the last ones. Raises BadInput or OSError that says what is wrong."""
-    averaged, last = read_json(run / "eval.json"), last_weights_flown(run)
+    averaged = read_json(run / "eval.json")
+    last = last_weights_flown(run)
     lines = [f"{run}", f"  {'':38}{'averaged':>12}{'last':>12}"]
     for key, (label, form) in task_of(averaged["env_id"]).seed_rows().items():
         both = [metrics.get(key) for metrics in (averaged, last)]

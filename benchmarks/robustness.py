@@ -104,8 +104,10 @@ def kill_and_resume(kills, seed=0):
             seconds = time.time() - before
     for kill in range(kills):
         with tempfile.TemporaryDirectory() as folder:
-            process, began = start(folder := Path(folder), *argv, slow_disk=kill % 2), time.time()
-            written, moment = f"runs/*/.{rng.choice(['training_state.pt', 'agent.safetensors'])}.*", rng.uniform()
+            process = start(folder := Path(folder), *argv, slow_disk=kill % 2)
+            began = time.time()
+            written = f"runs/*/.{rng.choice(['training_state.pt', 'agent.safetensors'])}.*"
+            moment = rng.uniform()
             process.join(seconds * moment)
             while kill % 2 and process.is_alive() and not list(folder.glob(written)):
                 time.sleep(0.0005)
@@ -151,7 +153,8 @@ WORDS += ["/", ".", "runs", "nowhere/file", "\0", "ü\n", "--", "-h", "'; rm -rf
 
 def random_arguments(rng, script):
     """A command line of one to four flags, some mutilated, with values that fit, nearly fit or do not fit at all."""
-    names, argv = [field.name for field in fields(script.Args)], []
+    names = [field.name for field in fields(script.Args)]
+    argv = []
     for _ in range(rng.integers(1, 5)):
         name = str(rng.choice(names)).replace("_", "-" if rng.random() < 0.9 else "_")
         if rng.random() < 0.1:
@@ -248,7 +251,9 @@ def load_state(script, folder):
 
 def fuzz_checkpoints(count, seed=0):
     """Damaged agent.safetensors and training_state.pt, and states that fit nothing or would run code."""
-    rng, ended, script = np.random.default_rng(seed), Counter(), importlib.import_module("ppo_gtrxl_di")
+    rng = np.random.default_rng(seed)
+    ended = Counter()
+    script = importlib.import_module("ppo_gtrxl_di")
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
         with contextlib.redirect_stdout(io.StringIO()):
             script.main([*TINY, "--total-updates=1"])
@@ -367,7 +372,8 @@ def main():
         print(f"{fuzz.__name__}, {args.fuzz} cases: {dict(fuzz(args.fuzz, args.seed))}", flush=True)
     memory, files, tensors = soak(args.soak).T
     first = min(99, len(memory) - 1)
-    growth, counted = memory[-1] / memory[first] - 1, set(tensors) - {0}
+    growth = memory[-1] / memory[first] - 1
+    counted = set(tensors) - {0}
     print(f"{args.soak} updates: memory {growth:+.2%} after the first 100, open files {min(files)} to {max(files)}")
     if counted:
         print(f"tensors after each hundredth: {min(counted):.0f} to {max(counted):.0f}")

@@ -49,7 +49,8 @@ class OurFeatures(VecEnvWrapper):
 
     def __init__(self, venv, script, env_id):
         constants = {name: torch.tensor(value) for name, value in script.BUFFERS[env_id].items()}
-        self.script, self.constants = script, SimpleNamespace(**constants)
+        self.script = script
+        self.constants = SimpleNamespace(**constants)
         size = self(venv.observation_space.sample()[None]).shape[1]
         super().__init__(venv, observation_space=gym.spaces.Box(-np.inf, np.inf, (size,), np.float32))
 
@@ -77,7 +78,10 @@ class OurCurriculum(BaseCallback):
 
     def __init__(self, script, args, batch, samples):
         super().__init__()
-        self.script, self.args, self.batch, self.samples = script, args, batch, samples
+        self.script = script
+        self.args = args
+        self.batch = batch
+        self.samples = samples
 
     def _on_rollout_start(self):
         progress = self.num_timesteps / self.samples

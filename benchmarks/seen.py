@@ -32,8 +32,10 @@ NAMES = ("h, three components", "e, three components", "log mass", "angle")
 
 def fly(agent, args, options, n):
     """n dispersed flights of the mean action: observed (T, n, obs), steps flown (n,), final misses by element (n,)."""
-    environment, seen = gym.make_vec(args.env_id, num_envs=1, **options), []
-    policy, rocket = agent.make_policy(environment.episode_steps), environment.rocket
+    environment = gym.make_vec(args.env_id, num_envs=1, **options)
+    seen = []
+    policy = agent.make_policy(environment.episode_steps)
+    rocket = environment.rocket
 
     def recorded(obs, t):
         seen.append(obs.copy())
@@ -64,7 +66,8 @@ def main():
         sys.exit(f"checkpoint {path}: its dispersion is 0; it must be of a rocket trained with --dispersion")
     obs, flown, misses = fly(agent, args, options, FLIGHTS)
     misses = {key.rsplit("_", 1)[0]: miss for key, miss in misses.items() if key != "apogee_km"}
-    dt, last = gym.make(args.env_id).unwrapped.batch.dt, int(flown.min())
+    dt = gym.make(args.env_id).unwrapped.batch.dt
+    last = int(flown.min())
     late = [last - round(seconds / dt) for seconds in (40, 10)]
     print("standard deviations of the differences, in their sizes:", ", ".join(NAMES))
     print("and R squared of the final misses by the differences:", ", ".join(misses))

@@ -108,10 +108,14 @@ def flop_of_epoch(bench, batch):
     scores and values d (L + C), positions d (L + 1). Backward twice as much, but for the observation's gradient.
     """
     args, (T, N) = bench.args, batch.alive.shape
-    L, d, m, h = args.memory_length, args.embed_dim, args.mlp_dim, args.hidden_dim
+    L = args.memory_length
+    d = args.embed_dim
+    m = args.mlp_dim
+    h = args.hidden_dim
     chunks = math.ceil(T / max(L // 2, 64))
     C = math.ceil(T / chunks)
-    inputs, actions = bench.agent.encoder[0].in_features, batch.actions.shape[-1]
+    inputs = bench.agent.encoder[0].in_features
+    actions = batch.actions.shape[-1]
     attention = chunks * C * d * (2 * (L + C) + L + 1)
     block = T * (2 * d * d + 4 * d * d + 2 * d * m) + 2 * (L + T) * d * d + attention
     heads = T * (2 * d * h + h * actions + h)
@@ -204,7 +208,8 @@ def gathered_epoch(bench, batch, samples):
     """Seconds of one epoch of shuffled samples with gathered windows; with `samples` only so many, scaled to all."""
     agent, args, (T, N) = bench.agent, bench.args, batch.alive.shape
     slots = block_inputs(agent, batch.obs.transpose(0, 1), batch.memory)
-    reach, order = torch.arange(args.memory_length), torch.randperm(T * N)
+    reach = torch.arange(args.memory_length)
+    order = torch.randperm(T * N)
     size = samples or math.ceil(T * N / args.num_minibatches)
     taken, start = 0, time.perf_counter()
     for chosen in order.split(size)[: 1 if samples else None]:
@@ -212,7 +217,8 @@ def gathered_epoch(bench, batch, samples):
         windows = slots[:, n[:, None], t[:, None] + reach]  # (blocks, B, L, d): steps t - L .. t - 1
         hidden = encode_gathered(agent, batch.obs[t, n], windows)
         newlogprob, entropy, newvalue = agent.evaluate_actions(hidden, batch.actions[t, n])
-        ratio, advantages = (newlogprob - batch.logprobs[t, n]).exp(), batch.advantages[t, n]
+        ratio = (newlogprob - batch.logprobs[t, n]).exp()
+        advantages = batch.advantages[t, n]
         clipped = ratio.clamp(1 - args.clip_coef, 1 + args.clip_coef)
         loss = (
             torch.max(-advantages * ratio, -advantages * clipped).mean()
@@ -248,7 +254,8 @@ def measure(size, threads, repeats, pipe=None, changes=None):
     with FlopCounterMode(display=False) as counted:
         bench.epoch(batch)
     products = seconds_of_products(lambda: bench.epoch(batch), 1)
-    flop, update = flop_of_epoch(bench, batch), rollout + bench.epochs * epoch
+    flop = flop_of_epoch(bench, batch)
+    update = rollout + bench.epochs * epoch
     figures = {
         "episodes x steps": f"{N} x {T}",
         "rollout": f"{rollout:.3f} s",
@@ -272,7 +279,8 @@ def compiled(size, threads, repeats, pipe):
     keep_memory()
     torch.set_num_threads(threads)
     script, preset = SIZES[size]
-    plain, quick = Workbench(script, **preset), Workbench(script, **preset)
+    plain = Workbench(script, **preset)
+    quick = Workbench(script, **preset)
     batch = plain.rollout()
     quick.agent.encode = torch.compile(quick.agent.encode)
     quick.agent.encode_step = torch.compile(quick.agent.encode_step)
@@ -298,7 +306,8 @@ def growth(path, repeats):
             T, L, N = {**base, name: value}.values()
             bench = Workbench(script.__name__, **network, memory_length=L, num_envs=N)
             steps = torch.randn(T, N)
-            obs, memory = torch.randn(T, N, 3), bench.agent.new_memory(N, 0.1)
+            obs = torch.randn(T, N, 3)
+            memory = bench.agent.new_memory(N, 0.1)
             batch = script.Batch(obs, steps[..., None], steps, steps, steps, torch.ones(T, N), memory)
             seconds.append(median_seconds(lambda: bench.epoch(batch), repeats)[0])  # noqa: B023
             print(f"T {T:4} L {L:3} N {N:3}: {seconds[-1]:.3f} s an epoch", flush=True)
@@ -324,7 +333,8 @@ def main():
         keep_memory()
         torch.set_num_threads(options.threads)
         return growth(options.growth, options.repeats)
-    spawn, function = multiprocessing.get_context("spawn"), compiled if options.compile else measure
+    spawn = multiprocessing.get_context("spawn")
+    function = compiled if options.compile else measure
     for size in options.sizes:
         ours, theirs = spawn.Pipe(duplex=False)
         process = spawn.Process(target=function, args=(size, options.threads, options.repeats, theirs))

@@ -251,7 +251,8 @@ class SingleEnv(Sealed, gym.Env):
         self.batch, self.render_mode = batch, batch.render_mode
         self.metadata = {key: value for key, value in batch.metadata.items() if key != "autoreset_mode"}
         self._running = False  # from a reset to the end of its episode
-        self.observation_space, self.action_space = batch.single_observation_space, batch.single_action_space
+        self.observation_space = batch.single_observation_space
+        self.action_space = batch.single_action_space
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
         """Start anew. Returns the observation and an empty info. `options` are the batch's without their first axis."""

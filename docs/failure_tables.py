@@ -83,7 +83,8 @@ def compared(by_loss: dict) -> list[list[str]]:
     for law, words in LAWS.items():
         if law == STANDARD:
             continue
-        large, none = by_loss[LARGE][law]["against"], by_loss["0"][law]["against"]
+        large = by_loss[LARGE][law]["against"]
+        none = by_loss["0"][law]["against"]
         both_saved = f"{interval(large, 'mass_kg')} of {large['mass_kg_flights']}"
         rows.append([words, interval(large, "saved_rate", 100, 0), interval(none, "mass_kg"), both_saved])
     return rows

@@ -79,7 +79,8 @@ def row(result, name):
     else:
         mass = found.get("mass_ratio_reached")
         cells = [span(found["error_norm"], 6), "–" if mass is None else span(100 * mass, 3) + " %"]
-    updates, minutes = found["total_updates"][0], np.median(found["wall_seconds"]) / 60
+    updates = found["total_updates"][0]
+    minutes = np.median(found["wall_seconds"]) / 60
     cells += [str(len(seeds)), str(updates), f"{minutes:.0f}"]
     return f"| [{name}](../../results/{result}/README.md) | {' | '.join(cells)} |\n"
 
@@ -92,7 +93,8 @@ def span(values, digits):
 
 def held_out_rows(result, name):
     """The rows of a result: a number's median and range over the reported seeds, and each held-out seed's."""
-    reported, held_out = found_by_seeds(result), found_by_seeds(f"held_out/{result}")
+    reported = found_by_seeds(result)
+    held_out = found_by_seeds(f"held_out/{result}")
     figures = next(figures for figures in FIGURES if figures.keys() <= reported.keys())
     rows = []
     for key, (label, factor, digits, unit) in figures.items():

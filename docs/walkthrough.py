@@ -103,7 +103,9 @@ def draw_update(names):
     from drawing.style import POLICY, TARGET
 
     batch = names["batch"]
-    x, advantages, ratio = batch.obs[..., :2].numpy(), batch.advantages.numpy(), ratios(names)
+    x = batch.obs[..., :2].numpy()
+    advantages = batch.advantages.numpy()
+    ratio = ratios(names)
     figure, axes = plt.subplots(1, 3, figsize=(9.3, 2.9), layout="constrained")
     axes[0].plot(x[:, :20, 0], x[:, :20, 1], color=POLICY["color"], linewidth=0.6, alpha=0.7)
     axes[0].plot(0, 0, "o", color=TARGET["color"])
@@ -122,7 +124,8 @@ def draw_flight(names):
     """Step 10: altitude, pitch of the thrust, and the error of the orbit in the last seconds, beside the optimum's."""
     from drawing.style import BOUNDARY, OPTIMUM, POLICY
 
-    rocket, flight = envs.ROCKETS[names["args"].env_id].rocket, names["flight"]
+    rocket = envs.ROCKETS[names["args"].env_id].rocket
+    flight = names["flight"]
     figure, axes = plt.subplots(1, 3, figsize=(9, 2.9), layout="constrained")
     for side, label, style in (("", "policy", POLICY), ("_reference", "optimum", OPTIMUM)):
         t, u, y = (flight[key + side] for key in ("t", "u", "y"))

@@ -103,7 +103,8 @@ class Sheet:
             for artist in self.moving:
                 artist.set_animated(True)
             self.canvas.draw()
-            self._limits, self._still = limits, self.canvas.copy_from_bbox(self.figure.bbox)
+            self._limits = limits
+            self._still = self.canvas.copy_from_bbox(self.figure.bbox)
         self.canvas.restore_region(self._still)
         for artist in sorted(self.moving, key=lambda artist: artist.zorder):
             self.figure.draw_artist(artist)

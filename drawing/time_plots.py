@@ -15,7 +15,8 @@ class TimePlots(Sheet):
 
     def __init__(self, title: str, labels: list[str], states: int, horizon: float, compared: bool = False, mark=None):
         super().__init__(title)
-        self.states, self.styles = states, [POLICY, OPTIMUM] if compared else [POLICY]
+        self.states = states
+        self.styles = [POLICY, OPTIMUM] if compared else [POLICY]
         columns = min(3, len(labels))
         rows = -(-len(labels) // columns)
         width, height = 0.96 / columns, 0.84 / rows
@@ -40,7 +41,8 @@ class TimePlots(Sheet):
         for k, ax in enumerate(self.panels):
             columns = [flight.y[:, k] if k < self.states else flight.u[:, k - self.states] for flight in flights]
             values = np.concatenate(columns)
-            low, high = min(0.0, values.min(initial=0.0)), max(0.0, values.max(initial=0.0))
+            low = min(0.0, values.min(initial=0.0))
+            high = max(0.0, values.max(initial=0.0))
             margin = 0.08 * (high - low) or 1.0
             ax.set(ylim=(low - margin, high + margin))
 

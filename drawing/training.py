@@ -92,7 +92,8 @@ def cut_outliers(ax, values: np.ndarray):
 
 def median_curve(curves: list[tuple]) -> tuple[np.ndarray, np.ndarray]:
     """Median over seeds at the first seed's steps, as far as every seed has come; curves are linear between steps."""
-    start, end = max(steps[0] for steps, _ in curves), min(steps[-1] for steps, _ in curves)
+    start = max(steps[0] for steps, _ in curves)
+    end = min(steps[-1] for steps, _ in curves)
     grid = curves[0][0]
     grid = grid[(start <= grid) & (grid <= end)]
     return grid, np.median([np.interp(grid, steps, values) for steps, values in curves], axis=0)

@@ -145,7 +145,8 @@ def load(script, checkpoint):
 def export(script, checkpoint) -> Any:
     """The ONNX program of a policy, with its metadata."""
     agent, args, options, envs = load(script, checkpoint)
-    names, shapes = ["observation"], {"observation": {0: torch.export.Dim("flights")}}
+    names = ["observation"]
+    shapes = {"observation": {0: torch.export.Dim("flights")}}
     inputs = [torch.ones(2, *envs.single_observation_space.shape, dtype=torch.float64)]
     outputs = ["action"]
     if args.num_blocks and args.memory_length:

@@ -85,8 +85,10 @@ class DescentSheet(Sheet):
     def fit(self, flights: list[Flight]):
         """Axes that hold all these flights and the box of the starts: of one scale, so that directions are true."""
         points = np.concatenate([flight.y[:, :3] for flight in flights])
-        centre, spread = np.array(self.lander.start[:3]), np.array(self.lander.spread[:3])
-        lowest, highest = np.minimum(centre - spread, 0.0), np.maximum(centre + spread, 0.0)
+        centre = np.array(self.lander.start[:3])
+        spread = np.array(self.lander.spread[:3])
+        lowest = np.minimum(centre - spread, 0.0)
+        highest = np.maximum(centre + spread, 0.0)
         margin = 0.05 * np.maximum(highest - lowest, 0.2 * highest[2])
         left, right = np.empty(3), np.empty(3)
         for axis in range(3):
@@ -97,7 +99,8 @@ class DescentSheet(Sheet):
         width, height = width * WIDTH, height * HEIGHT
         scale = max((right - left) / [width, width, (1 - BELOW) * height])  # m
         self.height = scale * height
-        bottom, middle = left[2] - BELOW * self.height, (left + right) / 2
+        bottom = left[2] - BELOW * self.height
+        middle = (left + right) / 2
         for axis, ax in enumerate(self.views):
             sides = middle[axis] - scale * width / 2, middle[axis] + scale * width / 2
             ax.set(xlim=sides, ylim=(bottom, bottom + self.height))
@@ -150,7 +153,9 @@ class DescentSheet(Sheet):
 
 def reading_of(y: np.ndarray) -> str:
     """Altitude (m), speed (m/s) and propellant used (kg), each on a line, at the end of states y (K+1, 7)."""
-    altitude, speed, propellant = max(y[-1, 2], 0.0), np.linalg.norm(y[-1, 3:6]), y[0, 6] - y[-1, 6]
+    altitude = max(y[-1, 2], 0.0)
+    speed = np.linalg.norm(y[-1, 3:6])
+    propellant = y[0, 6] - y[-1, 6]
     return f"{altitude:.0f}\n{speed:.{1 if speed < 10 else 0}f}\n{propellant:.0f}"
 
 
@@ -161,7 +166,8 @@ def descent_animation(lander: Lander, arrays: dict, title: str) -> Animation:
     """
     failed = np.flatnonzero(has_failed(arrays["effectiveness"][: len(arrays["y"])]))
     row = int(failed[0]) if len(failed) else 0
-    period, gravity = float(arrays["decision_s"]), arrays["gravity"][row]
+    period = float(arrays["decision_s"])
+    gravity = arrays["gravity"][row]
     sides = []
     for suffix, name in SIDES.items():
         y = flown_states(arrays.get(f"y{suffix}", NONE), row)

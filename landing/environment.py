@@ -105,13 +105,19 @@ class LanderVectorEnv(BatchedEnv):
         self.observation_scale = np.array([1000.0] * 3 + [50.0] * 3 + [self.longest_flight] + [1.0] * 3)
         if observe_draw:
             self.observation_scale = np.append(self.observation_scale, np.ones(7))
-        self.position_scale, self.speed_scale, self.sink_rate = POSITION_SCALE, SPEED_SCALE, 0.0
-        self.fuel_price, self.aloft_price, self.slope_price = FUEL_PRICE, ALOFT_PRICE, SLOPE_PRICE
+        self.position_scale = POSITION_SCALE
+        self.speed_scale = SPEED_SCALE
+        self.sink_rate = 0.0
+        self.fuel_price = FUEL_PRICE
+        self.aloft_price = ALOFT_PRICE
+        self.slope_price = SLOPE_PRICE
         self.slope_height, self.failed_fuel_share = SLOPE_HEIGHT, 1.0
         self.thrust_share, self.start_spread, self.wind = 1.0, 1.0, 0.0
         self.draw = np.zeros((num_envs, len(DRAW)))
         self.flights = self._drawn(self.draw)
-        self.r, self.v, self.mass = self.flights.r.copy(), self.flights.v.copy(), self.flights.mass.copy()
+        self.r = self.flights.r.copy()
+        self.v = self.flights.v.copy()
+        self.mass = self.flights.mass.copy()
         self.u = np.zeros((num_envs, 3))  # N, the clipped command of the step before
         self.down = np.zeros(num_envs, dtype=bool)
         self._ended = np.zeros(num_envs, dtype=bool)
@@ -292,7 +298,9 @@ class LanderVectorEnv(BatchedEnv):
         return dz / np.maximum(np.hypot(dx, dy), 1e-9)
 
     def _final_info(self):
-        position_error, speed, slope = self.position_error(), self.speed(), self.slope()
+        position_error = self.position_error()
+        speed = self.speed()
+        slope = self.slope()
         fuel = self.flights.mass - self.mass
         end = np.where(self.down, slope_reward(slope, SLOPE_PRICE), -ALOFT_PRICE)
         points = terminal_reward(position_error, speed, POSITION_SCALE, SPEED_SCALE)

@@ -8,7 +8,8 @@ from common.tasks import Interface
 from formats.columns import held, named, stacked
 from landing.lander import Lander
 
-POSITION, VELOCITY = ("x_m", "y_m", "z_m"), ("vx_m_s", "vy_m_s", "vz_m_s")
+POSITION = ("x_m", "y_m", "z_m")
+VELOCITY = ("vx_m_s", "vy_m_s", "vz_m_s")
 STATE = (*POSITION, *VELOCITY, "mass_kg")
 THRUST = ("thrust_x_N", "thrust_y_N", "thrust_z_N")
 GRAVITY = ("gravity_x_m_s2", "gravity_y_m_s2", "gravity_z_m_s2")

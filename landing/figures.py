@@ -108,7 +108,8 @@ def add_legend(figure: Figure, arrays: dict, chosen: list[int], lander: Lander |
 def chosen_flights(arrays: dict) -> list[int]:
     """The rows of the flights whose thrust is shown: the first healthy one, then failed ones, then the others."""
     failed = has_failed(arrays["effectiveness"][: len(arrays["y"])][:PATHS])
-    healthy, others = np.flatnonzero(~failed), np.flatnonzero(failed)
+    healthy = np.flatnonzero(~failed)
+    others = np.flatnonzero(failed)
     order = [*healthy[:1], *others[: THRUSTS - 1], *healthy[1:], *others[THRUSTS - 1 :]]
     return sorted(int(row) for row in order[:THRUSTS])
 
@@ -131,7 +132,8 @@ def plot_paths(ax, arrays: dict, axis: int, chosen: list[int]):
 
 def plot_thrust(ax, arrays: dict, row: int, lander: Lander | None):
     """The thrust that acted in one flight and in its optimum."""
-    period, gravity = float(arrays["decision_s"]), arrays["gravity"][row]
+    period = float(arrays["decision_s"])
+    gravity = arrays["gravity"][row]
     strike = strike_time(arrays["effectiveness"][row], period)
     sides = [(arrays["y"], {**POLICY, "color": HEALTHY if strike is None else FAILED})]
     sides.append((arrays["y_reference"], OPTIMUM))
@@ -168,7 +170,8 @@ def touchdown_figure(arrays: dict, title: str) -> Figure:
     plane, errors = figure.subplots(1, 2)
     final = arrays["final_y"]
     is_down = final[:, 2] < SMALLEST
-    position, speed = np.linalg.norm(final[:, :3], axis=1), np.linalg.norm(final[:, 3:6], axis=1)
+    position = np.linalg.norm(final[:, :3], axis=1)
+    speed = np.linalg.norm(final[:, 3:6], axis=1)
     colours = np.where(has_failed(arrays["effectiveness"]), FAILED, HEALTHY)
     look = {"s": min(3000 / len(final) ** 0.7, 40), "alpha": 0.6, "linewidths": 0}
     plane.scatter(*final[is_down, :2].T, c=colours[is_down], **look)
@@ -224,7 +227,8 @@ def draw_box(ax):
     """Logarithmic axes of the errors, which hold the corner of the published box, and the box itself."""
     ax.set(xscale="log", yscale="log")
     (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
-    left, bottom = min(left, POSITION_LIMIT / 10), min(bottom, SPEED_LIMIT / 10)
+    left = min(left, POSITION_LIMIT / 10)
+    bottom = min(bottom, SPEED_LIMIT / 10)
     ax.set(xlim=(left, max(right, 2 * POSITION_LIMIT)), ylim=(bottom, max(top, 2 * SPEED_LIMIT)))
     corners = [left, POSITION_LIMIT, POSITION_LIMIT], [SPEED_LIMIT, SPEED_LIMIT, bottom]
     ax.plot(*corners, zorder=4, **BOX)

@@ -195,7 +195,8 @@ def plan_one(job: Job) -> tuple[Trajectory | None, float]:
 
 def first_guesses(job: Job) -> list[Trajectory]:
     """The guesses from which IPOPT begins without a last plan."""
-    r, v = job.descent.state[None, :3], job.descent.state[None, 3:6]
+    r = job.descent.state[None, :3]
+    v = job.descent.state[None, 3:6]
     energy_optimal = float(energy_optimal_time(r, v, job.lander.gravity)[0])
     return [straight_line(job.lander, job.descent, share * energy_optimal, PLAN_INTERVALS) for share in DURATIONS]
 

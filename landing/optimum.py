@@ -371,7 +371,8 @@ def optimise_landing(lander: Lander, flights: Flights, k: int, glide_slope: floa
         y, end = shot(lander, descent, path)
     else:
         y, end = replayed(lander, flights, k, u)
-    position_error, speed = np.linalg.norm(y[-1, :3]), np.linalg.norm(y[-1, 3:6])
+    position_error = np.linalg.norm(y[-1, :3])
+    speed = np.linalg.norm(y[-1, 3:6])
     is_soft = position_error < POSITION_TOLERANCE and speed < SPEED_TOLERANCE
     differs = len(y) != len(path.y) or not abs(path.y[-1, 6] - y[-1, 6]) < FUEL_TOLERANCE
     fuel = float(y[0, 6] - y[-1, 6])

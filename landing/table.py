@@ -41,5 +41,6 @@ def failure_lines(metrics: dict) -> list[str]:
     if not metrics["failure_probability"]:
         return []
     when = "at a random moment" if metrics["failure_time"] == "random" else "from the start"
-    share, size = metrics["failure_probability"], metrics["failure_size"]
+    share = metrics["failure_probability"]
+    size = metrics["failure_size"]
     return [f"  A share of {share:g} of the flights has a hidden failure {when}, of size {size:g}."]

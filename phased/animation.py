@@ -18,7 +18,8 @@ class PhasePlane(Sheet):
 
     def __init__(self, problem: Problem, title: str = "", compared: bool = False):
         super().__init__(title or problem.env_id)
-        self.problem, self.styles = problem, [POLICY, OPTIMUM] if compared else [POLICY]
+        self.problem = problem
+        self.styles = [POLICY, OPTIMUM] if compared else [POLICY]
         position, velocity = problem.state_labels
         self.plane = self.panel((0.075, 0.16, 0.46, 0.765), xlabel=position, ylabel=velocity)
         horizon = problem.steps * problem.dt
@@ -72,7 +73,8 @@ class PhasePlane(Sheet):
     def fit(self, flights: list[Flight]):
         """Set axes that hold all these flights."""
         points = np.concatenate([flight.y for flight in flights])
-        x, y = room(1.15, 1.05 * points[:, 0]), room(1.15, 1.05 * points[:, 1])
+        x = room(1.15, 1.05 * points[:, 0])
+        y = room(1.15, 1.05 * points[:, 1])
         _, _, width, height = self.plane.get_position().bounds
         width, height = width * WIDTH, height * HEIGHT
         scale = max(x / width, y / height)  # one for both axes: circles are round

@@ -273,7 +273,8 @@ class PhasedVectorEnv(BatchedEnv):
         problem, phases = self.problem, self.problem.phases
         if self._alike or (phase == phase[0]).all():
             return problem.step(phases[phase[0]], x, u, self._parameters, h)
-        after, cost = np.empty((problem.states, self.num_envs)), np.zeros(self.num_envs)
+        after = np.empty((problem.states, self.num_envs))
+        cost = np.zeros(self.num_envs)
         for k in np.unique(phase):
             there = phase == k
             after[:, there], cost[there] = self._fly_some(there, phases[k], x, u, h)

@@ -28,7 +28,8 @@ def interface(
     scaled_action: bool = False,
 ) -> Interface:
     """What a policy observes and commands, with these options of the environment."""
-    states, controls = state_names(problem), control_names(problem)
+    states = state_names(problem)
+    controls = control_names(problem)
     clocks = ["tau", "phi"] if problem.waypoints else ["tau"]
     seen = list(states)
     if problem.waypoints:

@@ -22,7 +22,8 @@ def trajectories_figure(problem: Problem, arrays: dict, title: str) -> Figure:
     """
     if problem.states != 2 or problem.controls != 1 or problem.has_events:
         return time_figure(problem, arrays, title)
-    t, (position_name, velocity_name) = arrays["t"], problem.state_labels
+    t = arrays["t"]
+    (position_name, velocity_name) = problem.state_labels
     figure = Figure(figsize=(11, 8.5), layout="constrained")
     (plane, position), (velocity, control) = figure.subplots(2, 2)
     for suffix, style in (("", POLICY), ("_reference", OPTIMUM)):
@@ -165,7 +166,8 @@ def costs_figure(problem: Problem, arrays: dict, title: str) -> Figure:
     rows = [["all", "total", "total"], *([["state", "control", "terminal"]] if has_parts else [])]
     figure = Figure(figsize=(12, 3.5 * len(rows)), layout="constrained")
     panels = figure.subplot_mosaic(rows)
-    cost, reference_cost = arrays["cost"], arrays["cost_reference"]
+    cost = arrays["cost"]
+    reference_cost = arrays["cost_reference"]
     bins = np.histogram_bin_edges([cost, reference_cost], bins=min(40, max(5, len(cost) // 5)))
     panels["all"].hist(cost, bins, color="tab:red", alpha=0.45, label="policy")
     panels["all"].hist(reference_cost, bins, histtype="step", color="tab:blue", linewidth=1.4, label="optimum")
@@ -206,7 +208,8 @@ def cost_error_figure(problem: Problem, arrays: dict, title: str) -> Figure:
     Near the origin J* falls with |x0|^2 and the loss need not: such starts have the large ratios J / J*.
     """
     x0, best = arrays["x"][:, 0], arrays["cost_reference"]
-    loss, distance = np.maximum(arrays["cost"] - best, SMALLEST_LOSS), np.hypot(*x0.T)
+    loss = np.maximum(arrays["cost"] - best, SMALLEST_LOSS)
+    distance = np.hypot(*x0.T)
     figure = Figure(figsize=(12.5, 5.6), layout="constrained")
     box, over_distance = figure.subplots(1, 2)
     low, high = np.percentile(loss, [1, 99])

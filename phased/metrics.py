@@ -65,7 +65,8 @@ def ratio_metrics(cost: np.ndarray, reference_cost: np.ndarray, eval_seed: int) 
     A start whose optimum costs nothing has no ratio.
     """
     has_ratio = reference_cost != 0
-    cost, reference_cost = cost[has_ratio], reference_cost[has_ratio]
+    cost = cost[has_ratio]
+    reference_cost = reference_cost[has_ratio]
     if len(cost) == 0 or reference_cost.sum() == 0:
         return {}
     ratio = cost_ratio(cost, reference_cost)

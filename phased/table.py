@@ -25,14 +25,17 @@ def cost_rows(problem: Problem, metrics: dict) -> list[tuple]:
     """The cost, its parts, and the reward: label, optimum, ours, ratio."""
     all_compared = not problem.circles_count or metrics["hit_rate"] == metrics["reference_hit_rate"] == 1
     parts = {f"cost_{part}": f"  of it: {part}" for part in problem.parts}
-    optimum, ours = metrics["reference_cost_mean"], metrics["cost_mean"]
+    optimum = metrics["reference_cost_mean"]
+    ours = metrics["cost_mean"]
     of_starts = "" if problem.has_one_flight else f" (mean of {metrics['eval_starts']} starts)"
     rows = [row(f"cost J{of_starts}", optimum, ours, metrics.get("ratio_of_sums"))]
     for part, label in parts.items():
-        optimum, ours = metrics[f"reference_{part}_mean"], metrics[f"{part}_mean"]
+        optimum = metrics[f"reference_{part}_mean"]
+        ours = metrics[f"{part}_mean"]
         ratio = ours / optimum if all_compared and optimum > 0 else None
         rows.append(row(label, optimum, ours, ratio))
-    optimum, ours = metrics["reference_episodic_return"], metrics["episodic_return"]
+    optimum = metrics["reference_episodic_return"]
+    ours = metrics["episodic_return"]
     rows.append(row("reward (bonus - J, mean)", optimum, ours, None))
     if problem.has_events:
         rows.append(row("final time (s, mean)", metrics["reference_final_time_mean"], metrics["final_time_mean"], None))

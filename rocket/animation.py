@@ -55,7 +55,9 @@ class AscentSheet(Sheet):
         self.orbit.plot(
             *self._orbit(np.concatenate(self._target_state())), **{**TARGET, "linewidth": 4.0, "alpha": 0.4}
         )
-        low, high, side = -a * (1 + e), max(a * (1 - e), Re), max(a * np.sqrt(1 - e * e), Re)
+        low = -a * (1 + e)
+        high = max(a * (1 - e), Re)
+        side = max(a * np.sqrt(1 - e * e), Re)
         margin = 0.06 * (high - low)
         top = side + 3 * margin  # room for the caption, because a title above would meet the figure's title
         self.orbit.set(xlim=(low - margin, high + margin), ylim=(-side - margin, top), aspect="equal")
@@ -73,12 +75,16 @@ class AscentSheet(Sheet):
         """Draw the target orbit's altitude over the downrange from the pad, for half a turn."""
         angle = self.launch + np.linspace(0, np.pi, 721)
         r = self.rocket.a * (1 - self.rocket.e**2) / (1 + self.rocket.e * np.cos(angle))
-        x, y = (angle - self.launch) * self.rocket.Re / 1e3, (r - self.rocket.Re) / 1e3
+        x = (angle - self.launch) * self.rocket.Re / 1e3
+        y = (r - self.rocket.Re) / 1e3
         self.ascent.plot(x, y, **{**TARGET, "linewidth": 4.0, "alpha": 0.4})
         self.ascent.axhspan(-1e4, 0, color=EARTH, zorder=0)
 
     def _prepare_lines(self):
-        self.paths, self.pitches, self.orbits, self.dots = [], [], [], []
+        self.paths = []
+        self.pitches = []
+        self.orbits = []
+        self.dots = []
         for style in self.styles:
             self.paths += self.ascent.plot([], [], zorder=4, **style)
             self.pitches += self.pitch.plot([], [], zorder=4, **style)
@@ -145,7 +151,8 @@ class AscentSheet(Sheet):
         """Set axes that hold all these flights."""
         tracks = [self._track(flight.y) for flight in flights]
         x, altitude = (np.concatenate(values) for values in zip(*tracks))
-        top, right = room(ALTITUDE, 1.1 * altitude), room(DOWNRANGE, 1.03 * x)
+        top = room(ALTITUDE, 1.1 * altitude)
+        right = room(DOWNRANGE, 1.03 * x)
         pitch = np.concatenate([pitch_above_horizon(flight) for flight in flights])
         self.pitch.set(ylim=(-room(10.0, 1.1 * np.minimum(pitch, 0.0)), 100))
         self.pitch.set_xlim(0, max(self.rocket.end_time, *(flight.t[-1] for flight in flights)))
@@ -172,7 +179,8 @@ class AscentSheet(Sheet):
         elements = orbital_elements(y, self.rocket.mu)
         perigee, apogee = (elements.a * (1 + sign * elements.e) - self.rocket.Re for sign in (-1, 1))
         apogee = f"{apogee / 1e3:.0f}" if 0 < elements.a < 1e12 else "-"
-        altitude, speed = np.linalg.norm(y[:3]) - self.rocket.Re, np.linalg.norm(y[3:6])
+        altitude = np.linalg.norm(y[:3]) - self.rocket.Re
+        speed = np.linalg.norm(y[3:6])
         return f"{altitude / 1e3:.1f}\n{speed / 1e3:.2f}\n{y[6] / 1e3:.2f}\n{perigee / 1e3:.0f}\n{apogee}"
 
     def _show_rocket(self, flight: Flight, ended: bool):
@@ -212,7 +220,8 @@ class AscentSheet(Sheet):
 def stagings(rocket: Rocket, vehicle: Vehicles | None) -> list[tuple[float, str]]:
     """The ends (s) of all burns but the last and what is dropped then, for a drawn vehicle or the nominal one."""
     if vehicle is None:
-        ends, dropped = [burn.end for burn in rocket.burns], rocket.jettison
+        ends = [burn.end for burn in rocket.burns]
+        dropped = rocket.jettison
     else:
         ends = vehicle.burn_end[:, 0]
         dropped = [vehicle.dropped[vehicle.burn[:, 0] == k, 0].sum() for k in range(len(ends))]

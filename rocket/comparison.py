@@ -256,7 +256,8 @@ class Comparison:
         - `<name>_error_norm` and `<name>_final_mass_kg` of each competitor's flights, which are the first ones
         - `<name>_mass_reached_kg`: what the same optimum leaves in the orbit that the competitor reached
         """
-        vehicles, best = self.vehicles(self.draws(self.n)), self.best()
+        vehicles = self.vehicles(self.draws(self.n))
+        best = self.best()
         arrays = {"failure": vehicles.failure.T, "best_mass_kg": best.mass, "dry_mass_kg": vehicles.dry_mass}
         for name, ends in self.arrays.items():
             error = ends["final_error"]

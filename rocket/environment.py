@@ -176,12 +176,17 @@ class RocketVectorEnv(BatchedEnv):
         self._coasts = np.array([burn.is_coast for burn in self.rocket.burns])  # by phase
         self._has_coasts = bool(self._coasts.any())
         self.action_frame, self.observe_phase = action_frame, observe_phase
-        self.dispersion, self.observe_draw, self.observe_mass = dispersion, observe_draw, observe_mass
+        self.dispersion = dispersion
+        self.observe_draw = observe_draw
+        self.observe_mass = observe_mass
         self.failure, self.failure_time = failure, failure_time
         self.navigation_noise = checked_noise(navigation_noise)
         self._noise = np.zeros((num_envs, 0, OBSERVED))  # standard scores of the running episodes' observations
         self._noise_stream: tuple | None = None  # the seeded generator, and the noise's own
-        self.mass_weight, self.trajectory_weight, self.guidance_weight, self.guidance = 0.0, 0.0, 0.1, False
+        self.mass_weight = 0.0
+        self.trajectory_weight = 0.0
+        self.guidance_weight = 0.1
+        self.guidance = False
         self.terminal_scale = TERMINAL_SCALE
         super().__init__(num_envs, 1, *self._spaces(), render_mode, autoreset_mode)
         self._build()

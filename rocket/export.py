@@ -14,7 +14,8 @@ from rocket.metrics import apsides
 from rocket.orbits import target_axes
 from rocket.vehicle import Rocket
 
-POSITION, VELOCITY = ("x_m", "y_m", "z_m"), ("vx_m_s", "vy_m_s", "vz_m_s")
+POSITION = ("x_m", "y_m", "z_m")
+VELOCITY = ("vx_m_s", "vy_m_s", "vz_m_s")
 STATE = (*POSITION, *VELOCITY, "mass_kg")
 ACTIONS = {"eci": ("x", "y", "z"), "local": ("up", "along_track", "cross_track")}
 

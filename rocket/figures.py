@@ -18,7 +18,8 @@ from rocket.orbits import local_frame, orbit_vectors, target_axes, target_orbit
 from rocket.vehicle import Rocket
 
 DASHED = {"linewidth": 1.4, "linestyle": (0, (6, 5))}  # the gaps show the other line beneath
-OURS, BEST = {**POLICY, "linewidth": 2.2}, {**OPTIMUM, **DASHED}
+OURS = {**POLICY, "linewidth": 2.2}
+BEST = {**OPTIMUM, **DASHED}
 # velocities share a panel with positions, so they have the same widths and dashes, but paler colours
 VELOCITY = {**OURS, "color": "lightcoral"}, {**BEST, "color": "deepskyblue", "alpha": 0.6}
 FLIGHTS = {"": OURS, "_reference": BEST}  # by the suffix of their arrays
@@ -147,7 +148,8 @@ def plot_target_plane(plane, insertion, lines: dict, rocket: Rocket):
     middle = np.degrees(np.arctan2(launch[1], launch[0])) + 90  # no ascent goes further than half round the Earth
     for label, (r, style) in lines.items():
         x, y, _ = axes @ r.T
-        angle, altitude = (np.degrees(np.arctan2(y, x)) - middle + 180) % 360 - 180, np.linalg.norm(r, axis=1) - Re
+        angle = (np.degrees(np.arctan2(y, x)) - middle + 180) % 360 - 180
+        altitude = np.linalg.norm(r, axis=1) - Re
         altitude[1:][np.abs(np.diff(angle)) > 180] = np.nan  # no line from one edge to the other
         angle = angle + middle
         plane.plot(x / 1e3, y / 1e3, label=label, **style)
@@ -158,7 +160,8 @@ def plot_target_plane(plane, insertion, lines: dict, rocket: Rocket):
     plane.add_patch(Circle((0, 0), Re / 1e3, color="0.85", zorder=0))
     plane.text(0, 0, rocket.body, ha="center", va="center")
     a, b = rocket.a / 1e6, rocket.a / 1e6 * np.sqrt(1 - rocket.e**2)  # half axes
-    left, right = max(a * (1 + rocket.e), Re / 1e3), max(a * (1 - rocket.e), Re / 1e3)
+    left = max(a * (1 + rocket.e), Re / 1e3)
+    right = max(a * (1 - rocket.e), Re / 1e3)
     margin, half = 0.06 * left, 1.1 * max(b, Re / 1e3)
     plane.set(xlim=(-left - margin, right + margin), ylim=(-half, half), aspect="equal")
     first = "the target's perigee" if rocket.e else f"{rocket.argp:g}° from the target's node"  # a circle's axes
@@ -180,7 +183,8 @@ def plot_ground_track(ax, arrays: dict, rocket: Rocket):
         longitude = np.degrees(np.unwrap(np.arctan2(r[:, 1], r[:, 0])) - rocket.omega_e * t)
         ax.plot(longitude, np.degrees(np.arctan2(r[:, 2], np.hypot(r[:, 0], r[:, 1]))), label=label or None, **style)
     flown = np.concatenate([line.get_xydata() for line in ax.lines[2:]])
-    (west, south), (east, north) = flown.min(axis=0), flown.max(axis=0)
+    (west, south) = flown.min(axis=0)
+    (east, north) = flown.max(axis=0)
     ax.set(xlim=(west - 2, east + 2), ylim=(south - 2, north + 2), title="Ground track")
     ax.set(xlabel="longitude from the launch site (deg)", ylabel="geocentric latitude (deg)")
     ax.legend(loc="lower left")

@@ -239,9 +239,15 @@ def remaining_solver(rocket: Rocket, fixed: int, last: int):
     import casadi as ca
 
     ca.GlobalOptions.setNumpyMode(1)  # as in ascent_program
-    n, points, scale = fixed + last, len(GAUSS_POINTS), ca.DM(state_scale(rocket))
-    x, z, u = ca.MX.sym("x", 6, n), ca.MX.sym("z", 6, n * points), ca.MX.sym("u", 3, n * points)
-    duration, start, engine = ca.MX.sym("duration"), ca.MX.sym("start", 6), ca.MX.sym("engine", 4, fixed)
+    n = fixed + last
+    points = len(GAUSS_POINTS)
+    scale = ca.DM(state_scale(rocket))
+    x = ca.MX.sym("x", 6, n)
+    z = ca.MX.sym("z", 6, n * points)
+    u = ca.MX.sym("u", 3, n * points)
+    duration = ca.MX.sym("duration")
+    start = ca.MX.sym("start", 6)
+    engine = ca.MX.sym("engine", 4, fixed)
     burn, air, h, e = (ca.MX.sym(name, 3) for name in ("burn", "air", "h", "e"))
     mass, thrust, flow = ca.vertsplit(burn)
     dt, one = duration / last, ca.DM.ones(1, last)
@@ -286,7 +292,9 @@ def optimise_remaining(rocket: Rocket, remaining: RemainingAscent, guess: dict, 
     optimum has the same, and `final_time` (s), `final_mass` (kg) and `orbit_price` (5,): the kg that a unit of each
     number of `orbit_defect` saves. Raises NoOptimum if IPOPT finds none.
     """
-    n, points, scale = sum(intervals), len(GAUSS_POINTS), state_scale(rocket)
+    n = sum(intervals)
+    points = len(GAUSS_POINTS)
+    scale = state_scale(rocket)
     solve = remaining_solver(rocket, sum(intervals[:-1]), intervals[-1])
     ignition = np.append(remaining.begin, remaining.end)[-2]  # s, when the last arc begins
     if not remaining.end[-1] > ignition:  # a flow that is measured in dense air can even be negative
@@ -296,7 +304,8 @@ def optimise_remaining(rocket: Rocket, remaining: RemainingAscent, guess: dict, 
     directions = interpolate(t_u, guess["t_u"], guess["u"])
     w = np.concatenate([states.ravel(), directions.ravel(), [t[-1] - ignition]])
     box = np.full(len(w) - 1, 2.0)  # as in solve_from_guess
-    equal, radius = np.zeros(n * (7 * points + 6) + 5), np.full(n, 1 + 1 / rocket.Re)
+    equal = np.zeros(n * (7 * points + 6) + 5)
+    radius = np.full(n, 1 + 1 / rocket.Re)
     bounds = {"lbx": np.append(-box, 0.0), "ubx": np.append(box, remaining.end[-1] - ignition)}
     bounds |= {"lbg": np.append(equal, radius), "ubg": np.append(equal, np.full(n, np.inf))}
     solution = solve(x0=w, p=remaining_parameters(rocket, remaining, intervals), **bounds)
@@ -535,12 +544,16 @@ class Replanning:
             if plan is None:
                 self.failed += 1
                 continue
-            self.plans[k], self.ends[k], self.is_planned[k] = plan, plan["t"][-1], True
+            self.plans[k] = plan
+            self.ends[k] = plan["t"][-1]
+            self.is_planned[k] = True
             self.u[k, t:] = directions_at(plan, self.middles[t:])
 
     def _remaining_ascent(self, obs, now: float, k: int) -> RemainingAscent:
         """What is left of the last burn of flight k at `now` (s), when obs (9,) is observed."""
-        mass, thrust, flow = self.engine.mass[k], self.engine.thrust[k], self.engine.flow[k]
+        mass = self.engine.mass[k]
+        thrust = self.engine.thrust[k]
+        flow = self.engine.flow[k]
         burn_out = now + (mass - self.rocket.dry_mass) / flow
         end, thrust, flow, mass = (np.array([value]) for value in (burn_out, thrust, flow, mass))
         return RemainingAscent(now, obs[:6], end, thrust, flow, mass, *self.target)
@@ -603,7 +616,8 @@ def fly_optima(env_id: str, optima: list, directions_at=directions_at):
     The law knows the draws. It is flown to show that the optima's mass can be reached. `directions_at(optimum, times)`
     gives an optimum's directions.
     """
-    nominal, times = open_loop(env_id), middles(ROCKETS[env_id].rocket)
+    nominal = open_loop(env_id)
+    times = middles(ROCKETS[env_id].rocket)
     u = [directions_at(optimum, times) if optimum else None for optimum in optima]
 
     def policy(obs, t):

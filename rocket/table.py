@@ -112,7 +112,8 @@ def failure_lines(metrics: dict) -> list[str]:
         return []
     when = {"random": "from a random moment of a burn on", "ignition": "from the last stage's ignition on"}
     loss = f"up to {metrics['failure']:.0%} of thrust lost {when[metrics['failure_time']]}"
-    n, savable = metrics["failure_starts"], metrics["failure_savable"]
+    n = metrics["failure_starts"]
+    savable = metrics["failure_savable"]
     lines = [f"  {n} flights with a failure, {loss}; {savable} of them can be saved"]
     if "failure_saved_rate" in metrics:
         errors = ", ".join(f"{name} {metrics[f'failure_error_{name}']:.6f}" for name in ("median", "p95"))

@@ -261,7 +261,8 @@ class RocketTask:
 
         if "saved" not in arrays:
             return ascent_animation(self.mission.rocket, arrays, self.headline(metrics))
-        draw, options = arrays["draw"][arrays["saved"]][None], (metrics["failure"], metrics["failure_time"])
+        draw = arrays["draw"][arrays["saved"]][None]
+        options = (metrics["failure"], metrics["failure_time"])
         vehicle = draw_vehicles(self.mission.rocket, metrics.get("dispersion", 0.0), draw, *options)
         error = np.linalg.norm(arrays["final_error"][arrays["saved"]])
         title = f"{self.env_id}: a flight that loses thrust, ||error|| {error:.6f}, and the optimum without a loss"
@@ -317,7 +318,10 @@ class RocketTask:
 
     def baseline_command(self, args) -> tuple[dict, dict]:
         if not args.failure:
-            refuse_unless(not args.dispersion, "--dispersion", args.dispersion, "must be 0 without --failure")
+            unless_failing = {"dispersion": 0.0, "failure_time": "random", "starts": DISPERSED_STARTS, "seed": 0}
+            for name, default in unless_failing.items():
+                flag, value = f"--{name.replace('_', '-')}", getattr(args, name)
+                refuse_unless(value == default, flag, value, "must be left out without --failure")
             return report_rocket(self.env_id)
         refuse_unless(self.mission.cutoff, "--failure", args.failure, NEEDS_CUTOFF)
         failing = Failing(args.dispersion, args.failure, args.failure_time)

@@ -377,7 +377,8 @@ def check_rocket(rocket: Rocket):
     last = rocket.burns[-1].end
     allowed = f"must be at most the last burn's end, {last}"
     refuse_unless(rocket.end_time <= last, "a rocket's end_time", rocket.end_time, allowed)
-    thrust, weight = rocket.burns[0].thrust, rocket.x0[6] * rocket.mu / rocket.Re**2
+    thrust = rocket.burns[0].thrust
+    weight = rocket.x0[6] * rocket.mu / rocket.Re**2
     allowed = f"must be above the weight at lift-off, {weight:.6g} N"
     refuse_unless(thrust > weight, "the thrust of burns[0]", f"{thrust:.6g} N", allowed)
     if min(rocket.i, 180 - rocket.i) < abs(rocket.latitude):
@@ -404,7 +405,8 @@ def check_burns(rocket: Rocket):
         refuse_unless(burn.engines or may_coast, f"burns[{k}].engines", burn.engines, allowed)
         aboard = engines_aboard(rocket, k)
         for number, engine in burn.engines:
-            field, has = f"the number of an engine in burns[{k}].engines", aboard.get(engine, 0)
+            field = f"the number of an engine in burns[{k}].engines"
+            has = aboard.get(engine, 0)
             allowed = "must be dropped by this burn or a later one, or burn in the last: it is not aboard"
             refuse_unless(has > 0, f"an engine of burns[{k}]", engine, allowed)
             allowed = f"must be positive and at most {has}: so many are dropped then or later, or are of the last burn"
@@ -412,9 +414,11 @@ def check_burns(rocket: Rocket):
         for number, _ in burn.dropped:
             refuse_unless(number > 0, f"the number of an engine in burns[{k}].dropped", number, "must be positive")
         start = burn.end
-    last, allowed = rocket.burns[-1].dropped, "must be empty: the last burn's engines stay aboard"
+    last = rocket.burns[-1].dropped
+    allowed = "must be empty: the last burn's engines stay aboard"
     refuse_unless(not last, f"burns[{k}].dropped", f"{last!r:.60}", allowed)
-    first, used = engines_aboard(rocket, 0), propellant_used(rocket)
+    first = engines_aboard(rocket, 0)
+    used = propellant_used(rocket)
     runs_dry = [engine for _, engine in rocket.burns[-1].engines] if rocket.table_isp else []
     for k, burn in enumerate(rocket.burns):
         for _, engine in burn.engines:

@@ -5,6 +5,7 @@ The optimum against the environment that flies it, another optimum's numbers, an
 
 import json
 import math
+import re
 import shutil
 from pathlib import Path
 
@@ -555,6 +556,16 @@ def test_opponents_that_do_not_fit_are_one_line(monkeypatch, tmp_path, argv, lin
     with pytest.raises(SystemExit) as refusal:
         evaluate.main()
     assert str(refusal.value).startswith(line) and "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("flag", ["--dispersion=1", "--failure-time=ignition", "--starts=5", "--seed=7"])
+def test_flags_of_failing_flights_need_a_failure(monkeypatch, flag):
+    monkeypatch.setattr("rocket.task.report_rocket", None)  # nothing is solved
+    monkeypatch.setattr("sys.argv", ["baselines.py", "RocketAscentCutoff-v0", flag])
+    with pytest.raises(SystemExit) as refusal:
+        baselines.main()
+    name, value = flag.split("=")
+    assert re.fullmatch(f"error: {name} is '?{value}(.0)?'?; it must be left out without --failure", refusal.value.code)
 
 
 def test_a_landers_opponents_take_no_failure(tmp_path):
