@@ -61,6 +61,8 @@ STARTS_PER_PROCESS = 100  # fewer starts are solved sooner than another process 
 def box_qp(problem: Problem, x0):
     """Optimal controls u (n, T) of the bounded double integrator from x0 (n, 2), to check the clipped LQR.
 
+    `problem` has one phase and one control.
+
     All states are written as x = Phi x0 + Gamma u, the condensed form of model predictive control (e.g. Rawlings and
     Mayne). This leaves least squares in u within |u| <= u_max, which SciPy's active-set method BVLS solves.
     """

@@ -161,7 +161,10 @@ def move(staged, folder, last, replaced):
 
 
 def redraw(folder) -> list[Path]:
-    """Draw the figures of a results or run folder from its files. Returns their paths."""
+    """Draw the figures of a results or run folder from its files. Returns their paths.
+
+    Raises OSError or ValueError that names the file that is missing or damaged.
+    """
     folder = Path(folder)
     metrics, arrays = read_evaluation(folder)
     curves = {path.stem: read_csv(path) for path in sorted((folder / "seeds").glob("*.csv"))}
@@ -177,7 +180,10 @@ def draw_figures(folder, arrays: dict, metrics: dict, curves: list[dict]) -> lis
 
 
 def animate(folder) -> Path:
-    """Write figures/animation.gif of a results or run folder from its eval.json and eval.npz. Returns its path."""
+    """Write figures/animation.gif of a results or run folder from its eval.json and eval.npz. Returns its path.
+
+    Raises OSError or ValueError that names the file that is missing or damaged.
+    """
     folder = Path(folder)
     metrics, arrays = read_evaluation(folder)
     return draw_animation(folder, arrays, metrics)
@@ -191,7 +197,10 @@ def draw_animation(folder, arrays: dict, metrics: dict) -> Path:
 
 
 def seed_lines(folder) -> list[str]:
-    """The table of a results folder's seeds, with a row for each number and its median and range. None for one seed."""
+    """The table of a results folder's seeds, with a row for each number and its median and range. None for one seed.
+
+    Raises ValueError if one of the numbers is none.
+    """
     runs = [read_json(path) for path in (Path(folder) / "seeds").glob("*.json")]
     runs.sort(key=lambda run: run["seed"])
     if len(runs) < 2:
@@ -311,6 +320,8 @@ def export_command(args):
         raise BadInput(f"nothing to export: name a file by {', '.join(f'--{name}' for name in FORMATS)}")
     if len({path.resolve() for path in targets.values()}) < len(targets):
         raise BadInput("two of the flags name one file: each must have a file of its own")
+    if args.epoch != EPOCH and not targets.keys() & {"oem", "czml"}:
+        raise BadInput(f"--epoch is {args.epoch:%Y-%m-%dT%H:%M:%SZ}; it needs --oem or --czml")
     export(args.folder, targets, args.epoch, args.launch_longitude)
     for path in targets.values():
         print(path)

@@ -186,7 +186,7 @@ def features(agent, obs):
 
 
 def mean_action(output, action_scale):
-    """The policy's mean, in the action's unit. It has no bound: the environment clips the action."""
+    """The policy's mean (..., actions), in the action's unit. It has no bound: the environment clips the action."""
     return output * action_scale
 
 
@@ -558,7 +558,7 @@ def gae(rewards, values, alive, gamma, gae_lambda):
 
 
 def moments(x, alive, dim):
-    """Mean and variance of x along dim, over the living steps of all processes. `dim` is kept with length 1."""
+    """Mean and variance of x (T, N, ...) along dim, over the living steps of all processes. dim is kept as 1."""
     count = all_reduce_sum(alive.sum(dim, keepdim=True)).clamp(min=1)
     mean = all_reduce_sum((x * alive).sum(dim, keepdim=True)) / count
     variance = all_reduce_sum(((x - mean) ** 2 * alive).sum(dim, keepdim=True)) / count
@@ -778,6 +778,7 @@ def train(args, agent, average, optimizer, envs, run, gradient=ppo_gradient):
 
 
 def main(argv):
+    """Train and evaluate, or with --eval-only evaluate, by the flags `argv`."""
     args, saved = runs.parse_args(Args, recipe, argv, ENV_OPTIONS, BUFFERS)
     device = runs.prepare_torch(args)
     env_options = {name: getattr(args, name) for name in ENV_OPTIONS} | FIXED_OPTIONS

@@ -480,7 +480,7 @@ def prepare_torch(args):
 
 
 def make_envs(args, env_options):
-    """This process's share of the environments, made with env_options and seeded."""
+    """This process's share of the environments, made with env_options and seeded. Raises BadInput for a bad option."""
     rank, processes = rank_and_world_size()
     share = args.num_envs // processes + (rank < args.num_envs % processes)
     envs = make_batch(args.env_id, share, **env_options)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.command_line import integer
+from common.errors import refuse_unless
 from common.tasks import GroundTask, Interface
 from landing import export
 from landing.comparison import compare
@@ -151,6 +152,9 @@ class LanderTask(GroundTask):
         parser.add_argument("--seed", type=integer(0, 2**32 - 1), default=0, metavar="S", help="default 0")
 
     def baseline_command(self, args) -> tuple[dict, dict]:
+        if self.lander.has_one_flight:
+            refuse_unless(args.starts == 20, "--starts", args.starts, f"must be left out: {self.env_id} has one start")
+            refuse_unless(args.seed == 0, "--seed", args.seed, f"must be left out: {self.env_id} has one start")
         return report_lander(self.env_id, args.starts, args.seed)
 
     def fly_opponents(self, folder, **options) -> None:

@@ -136,7 +136,10 @@ def program(problem: Problem, mesh: Mesh, defect: Callable, in_circles: bool):
 
 @cache
 def solver(problem: Problem, mesh: Mesh, defect: Callable, in_circles: bool):
-    """IPOPT for `program`, built once per process: its CasADi function, and the arguments that all starts share."""
+    """IPOPT for `program`, built once per process: its CasADi function, and the arguments that all starts share.
+
+    Raises NoOptimum if the table's functions make no program.
+    """
     import casadi as ca
 
     options = {
