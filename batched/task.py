@@ -67,8 +67,8 @@ class BatchedTask(SampledTask):
         try:
             make_batch(self.env_id, 1, **env_options)
         except BadInput as error:
-            name = next((name for name, value in env_options.items() if not value), "env_id")
-            return (name if name == "env_id" else f"no_{name}"), str(error)
+            name = str(error).split()[0]  # every such message begins with its field
+            return (f"no_{name}" if name in env_options else "env_id"), str(error)
         return None
 
     # --- words and pictures

@@ -62,13 +62,15 @@ def compare(name: str, job, seconds: int) -> str:
 def main():
     parser = OneLineParser(description=__doc__.splitlines()[0])
     jobs = first_jobs()
-    parser.add_argument("results", nargs="*", help="results folders; without one, all")
+    parser.add_argument(
+        "results", nargs="*", type=lambda name: name.rstrip("/"), help="results folders; without one, all"
+    )
     parser.add_argument("--seconds", type=integer(5, 3600), default=50, help="seconds of each training")
     options = parser.parse_args()
     names = options.results or list(jobs)
     unknown = sorted(set(names) - jobs.keys())
     if unknown:
-        sys.exit(f"error: results {', '.join(unknown)} must be among {', '.join(jobs)}")
+        sys.exit(f"error: {', '.join(unknown)} must be among {', '.join(jobs)}")
     print(f"{'steps a second':26}{'alone':>10}{'the shipped run':>22}{'ratio':>10}{'updates':>10}", flush=True)
     try:
         for name in names:

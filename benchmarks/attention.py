@@ -26,6 +26,7 @@ sys.path.insert(0, str(ROOT))
 import runs  # noqa: E402
 from common.checkpoints import read_checkpoint  # noqa: E402
 from common.command_line import OneLineParser, integer  # noqa: E402
+from common.errors import refuse_unless  # noqa: E402
 from common.tasks import task_of  # noqa: E402
 from drawing.style import save_figures  # noqa: E402
 
@@ -36,7 +37,8 @@ SCRIPTS = [importlib.import_module(path.stem) for path in sorted(ROOT.glob("ppo_
 def load(checkpoint):
     """The agent of an agent.safetensors, its script's arguments, and the options of its environments."""
     env_id = read_checkpoint(checkpoint, {})["args"]["env_id"]
-    (script,) = (script for script in SCRIPTS if env_id in script.ENV_IDS)
+    script = next((script for script in SCRIPTS if env_id in script.ENV_IDS), None)
+    refuse_unless(script, f"env_id of {checkpoint}", env_id, "must be one that a script trains")
     argv = ["--eval-only", "--checkpoint", str(checkpoint)]
     args, saved = runs.parse_args(script.Args, script.recipe, argv, script.ENV_OPTIONS, script.BUFFERS)
     args.dispersion = saved["args"].get("dispersion", 0.0)

@@ -7,7 +7,7 @@
 Each size and way runs in its own process. All processes prepare at the same time, and are timed one after the other.
 It prints
 
-- the seconds of an update, the median of three, and of its rollout and its epochs
+- the seconds of an update, the median of three, and of its rollout
 - where one more update spends its seconds, with the GPU waited for after each part
 - the launches of a step and of a minibatch, and the kernels that they run (torch's profiler)
 - how far a rollout's policy is from the same policy in training, at log-std -8: the KL divergence of the first
@@ -59,7 +59,6 @@ class Stopwatch:
 
     def __init__(self):
         self.seconds = Counter()
-        self.calls = Counter()
 
     def wrap(self, name, function):
         def timed(*args, **kwargs):
@@ -68,7 +67,6 @@ class Stopwatch:
             result = function(*args, **kwargs)
             synchronize()
             self.seconds[name] += time.perf_counter() - start
-            self.calls[name] += 1
             return result
 
         return timed

@@ -46,7 +46,7 @@ def last_weights_flown(run: Path) -> dict:
         state["average"] = state["agent"]
         flags = flags_of(state["args"])
     except Exception as error:  # a missing or damaged file fails in many ways, which are all the same to the user
-        raise BadInput(f"{run} must hold a run's training_state.pt ({error})") from error
+        raise BadInput(f"{run} must hold a run's training_state.pt ({' '.join(str(error).split()):.120})") from error
     with tempfile.TemporaryDirectory() as folder:
         runs.save_run(Path(folder), state)
         weights = Path(folder) / "agent.safetensors"

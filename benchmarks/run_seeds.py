@@ -44,9 +44,13 @@ class Job:
     command: list[str]  # script and flags
     args: dict  # the script's arguments with these flags
 
+    def identity(self):
+        """The arguments that tell this job's run from others."""
+        return {name: value for name, value in self.args.items() if name not in MACHINE}
+
     def run_dir(self):
         """The newest run in runs/ that has the arguments of this job, or None."""
-        mine = {name: value for name, value in self.args.items() if name not in MACHINE}
+        mine = self.identity()
         for path in sorted(Path("runs").glob("*/args.json"), key=lambda path: path.stat().st_mtime, reverse=True):
             others = read_args(path)
             if mine == {name: value for name, value in others.items() if name not in MACHINE}:
@@ -153,9 +157,9 @@ def publish(job, numbers):
 
 
 def next_free(waiting, running):
-    """The first waiting job that would not go on with the run of a running job, or None."""
-    busy = {job.run_dir() for job in running}
-    return next((job for job in waiting if job.run_dir() is None or job.run_dir() not in busy), None)
+    """The first waiting job that has other arguments than the running jobs, and so another run. None without one."""
+    busy = [job.identity() for job in running]
+    return next((job for job in waiting if job.identity() not in busy), None)
 
 
 def work(jobs, at_once, numbers):

@@ -89,13 +89,18 @@ def compare(name, command, commits, updates, temporary):
 
 def main():
     parser = OneLineParser(description=__doc__.splitlines()[0])
-    parser.add_argument("results", nargs="*", help="folders of results/commits.json; without one, all")
+    parser.add_argument(
+        "results",
+        nargs="*",
+        type=lambda name: name.rstrip("/"),
+        help="folders of results/commits.json; without one, all",
+    )
     parser.add_argument("--updates", type=integer(1, 10**6), default=6, help="updates of each training")
     options = parser.parse_args()
     commits = json.loads(COMMITS.read_text())
     unknown = sorted(set(options.results) - commits.keys())
     if unknown:
-        sys.exit(f"error: results {', '.join(unknown)} must be among {', '.join(commits)}")
+        sys.exit(f"error: {', '.join(unknown)} must be among {', '.join(commits)}")
     try:
         with tempfile.TemporaryDirectory() as folder:
             names, jobs = options.results or commits, first_jobs()

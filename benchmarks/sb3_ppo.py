@@ -35,7 +35,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 import evaluate  # noqa: E402
 import runs  # noqa: E402
-from common.command_line import OneLineParser  # noqa: E402
+from common.command_line import OneLineParser, integer  # noqa: E402
 from common.files import write_json  # noqa: E402
 from common.tasks import env_ids, task_of  # noqa: E402
 from sb3_env import NativeVecEnv  # noqa: E402
@@ -87,7 +87,7 @@ class OurCurriculum(BaseCallback):
         progress = self.num_timesteps / self.samples
         self.args.log_std = self.model.policy.log_std.mean().item()  # as it was learned
         self.script.set_curriculum(self.batch, self.args, progress)
-        if hasattr(self.args, "mass_weight"):
+        if hasattr(type(self.args), "mass_weight"):  # the rocket's script
             price = np.interp(progress, [0.25, 0.6, 1.0], [0.0, 1.0, 0.1])
             self.batch.mass_weight = float(self.batch.cutoff * self.args.mass_weight * price)
         self.batch.flights_per_start = 1  # the library compares no flights of one start
@@ -222,8 +222,8 @@ def commit():
 
 
 def script_of(env_id):
-    """Our script that trains an id."""
-    return next(script for script in map(importlib.import_module, SCRIPTS) if env_id in script.ENV_IDS)
+    """Our script that trains an id, None if it is none of SCRIPTS."""
+    return next((script for script in map(importlib.import_module, SCRIPTS) if env_id in script.ENV_IDS), None)
 
 
 def flag(name):
@@ -232,16 +232,18 @@ def flag(name):
 
 def parse_args():
     parser = OneLineParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--env-id", default="DoubleIntegrator-v0", choices=env_ids())
-    parser.add_argument("--samples", type=int, default=2_560_000)
+    parser.add_argument(
+        "--env-id", default="DoubleIntegrator-v0", choices=[env_id for env_id in env_ids() if script_of(env_id)]
+    )
+    parser.add_argument("--samples", type=integer(1, 10**9), default=2_560_000)
     parser.add_argument("--features", default="ours", choices=["ours", "raw"])
     parser.add_argument("--recurrent", action="store_true", help="an LSTM: sb3-contrib's RecurrentPPO")
     parser.add_argument("--dispersion", type=float, help="every flight another vehicle (a rocket's)")
     parser.add_argument("--mass-weight", type=float, default=3.0, help="highest price of a mission's mass_unit")
     parser.add_argument("--log-std", type=float, help="first log-std (default: our script's, or that of --start)")
-    parser.add_argument("--num-envs", type=int, default=32)
-    parser.add_argument("--batch-size", type=int, default=64)
-    parser.add_argument("--epochs", type=int, default=10)
+    parser.add_argument("--num-envs", type=integer(1, 10**9), default=32)
+    parser.add_argument("--batch-size", type=integer(1, 10**9), default=64)
+    parser.add_argument("--epochs", type=integer(1, 10**9), default=10)
     parser.add_argument("--learning-rate", type=float, default=3e-4, help="falls linearly to zero")
     parser.add_argument("--gamma", type=float, default=0.99)
     parser.add_argument("--seed", type=int, default=1)
@@ -278,7 +280,7 @@ def main():
     args = script.Args(**{**script.recipe(script.Args(env_id=options.env_id)), "env_id": options.env_id})
     args.log_std, args.flights_per_start = script.Args().log_std, 1  # the library learns its noise
     given = {name: getattr(options, name) for name in ("dispersion", "mass_weight", "log_std")}
-    vars(args).update({name: value for name, value in given.items() if value is not None})
+    vars(args).update({name: value for name, value in given.items() if value is not None and hasattr(args, name)})
     env_options = {name: getattr(args, name) for name in script.ENV_OPTIONS} | script.FIXED_OPTIONS
 
     batch = gym.make_vec(options.env_id, num_envs=options.num_envs, **env_options).unwrapped

@@ -61,9 +61,9 @@ def main():
     try:
         agent, args, options = load(path)
     except BadInput as error:
-        sys.exit(str(error))
+        sys.exit(f"error: {error}")
     if not args.dispersion:
-        sys.exit(f"checkpoint {path}: its dispersion is 0; it must be of a rocket trained with --dispersion")
+        sys.exit(f"error: checkpoint {path}: its dispersion is 0; it must be of a rocket trained with --dispersion")
     obs, flown, misses = fly(agent, args, options, FLIGHTS)
     misses = {key.rsplit("_", 1)[0]: miss for key, miss in misses.items() if key != "apogee_km"}
     dt = gym.make(args.env_id).unwrapped.batch.dt
@@ -71,7 +71,8 @@ def main():
     late = [last - round(seconds / dt) for seconds in (40, 10)]
     print("standard deviations of the differences, in their sizes:", ", ".join(NAMES))
     print("and R squared of the final misses by the differences:", ", ".join(misses))
-    for t in [*range(50, late[0], round(100 / dt)), *late]:
+    period = round(100 / dt)
+    for t in [*range(period, late[0], period), *late]:
         differences = SCRIPT.features(agent, obs[t])[:, -len(SCRIPT.DIFFERENCES) :].numpy()
         spread = " ".join(f"{size:5.2f}" for size in differences.std(axis=0))
         shares = (f"{explained(differences, y):5.2f}" for y in misses.values())

@@ -75,9 +75,12 @@ def utc(text: str) -> datetime:
     """Argument type: a moment in ISO 8601, in UTC unless it names another zone."""
     try:
         moment = datetime.fromisoformat(text)
-    except ValueError as error:
+        moment = moment.replace(tzinfo=UTC) if moment.tzinfo is None else moment.astimezone(UTC)
+    except (OverflowError, ValueError) as error:
         raise argparse.ArgumentTypeError(f"{text!r} must be a moment such as 2026-01-01T12:00:00") from error
-    return moment.replace(tzinfo=UTC) if moment.tzinfo is None else moment.astimezone(UTC)
+    if not 1900 <= moment.year <= 2200:
+        raise argparse.ArgumentTypeError(f"{text!r} must be a moment of the years 1900 to 2200")
+    return moment
 
 
 def longitude(text: str) -> float:

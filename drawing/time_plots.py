@@ -11,7 +11,7 @@ from drawing.style import OPTIMUM, POLICY
 
 
 class TimePlots(Sheet):
-    """Any number of flights. `mark(panels)` draws the still parts, and `limits` are the axes of the last panels."""
+    """Any number of flights over `horizon` seconds. `mark(panels)` draws still parts, `compared` adds the optimum's."""
 
     def __init__(self, title: str, labels: list[str], states: int, horizon: float, compared: bool = False, mark=None):
         super().__init__(title)

@@ -72,6 +72,9 @@ class PlanePage {
       ["policy / optimum", (policy.cost / optimum.cost).toFixed(6), ""],
     ];
     policy.hits.forEach((hit, k) => {
+      if (this.problem.phases[k].radius === null) {
+        return;
+      }
       const words = (isHit) => (isHit ? "hit" : "missed");
       rows.push([`circle of phase ${k + 1}`, words(hit), words(optimum.hits[k])]);
     });

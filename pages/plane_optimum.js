@@ -136,15 +136,15 @@ function improved(problem, steps, start, guess, circles) {
 
 // The optimum that ends each phase in its circle, null where none was found.
 function inCircles(problem, steps, start, guess) {
-  const circles = problem.phases.map(() => ({ multiplier: 0, weight: 1 }));
+  const circles = problem.phases.map(({ radius }) => (radius === null ? null : { multiplier: 0, weight: 1 }));
   let found = guess;
   for (let round = 0; round < 30; round += 1) {
     const { u } = found;
     found = improved(problem, steps, start, (_, t) => u[t], circles);
     let worst = 0;
     for (const [t, { phase, number, isLast }] of steps.entries()) {
-      if (isLast) {
-        const circle = circles[number];
+      const circle = circles[number];
+      if (isLast && circle) {
         const violation = (distance(found.x[t + 1], phase.target) / (phase.radius * SHRUNK)) ** 2 - 1;
         worst = Math.max(worst, circle.multiplier > 0 ? Math.abs(violation) : violation);
         circle.multiplier = Math.max(circle.multiplier + circle.weight * violation, 0);

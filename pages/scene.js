@@ -4,7 +4,6 @@
 // It needs numbers.js, rocket_laws.js, chart.js for its colours, vendor/three.min.js and vendor/coastlines.js.
 
 const LIGHT = { ...COLORS, optimum: "#6ab0e0", openLoop: "#aaaaaa", target: "#5bd65b" }; // on a dark ground
-const VIEWS = ["ascent", "rocket", "globe", "orbit"];
 
 class Scene {
   constructor(container, data) {
@@ -126,7 +125,7 @@ class Scene {
     this.render();
   }
 
-  // Look from one of VIEWS.
+  // Look from "ascent", "rocket", "globe" or "orbit".
   look(view) {
     this.isFollowing = view === "rocket";
     const { y } = this.flights.policy;
