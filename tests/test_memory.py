@@ -20,6 +20,7 @@ import baselines
 import envs
 import evaluate
 import ppo_gtrxl_di as script
+import runs
 from phased.metrics import ratio_metrics
 
 ROOT = Path(__file__).parent.parent
@@ -162,7 +163,7 @@ def test_the_heaviest_weight_is_on_an_earlier_step_of_the_flight():
 
 
 def test_every_row_of_the_tables_has_its_three_jobs(monkeypatch):
-    """Seeds 1 to 3 of each, by the command of the shipped row with what the row says changed."""
+    """The seeds that are published, by the command of the shipped row with what the row says changed."""
     monkeypatch.chdir(ROOT)  # other shipped commands name the shipped policy
     jobs = run_seeds.read_jobs(ROOT / "benchmarks" / "memory_di_jobs.txt")
     shipped = run_seeds.read_jobs(ROOT / "benchmarks" / "result_jobs.txt")
@@ -176,7 +177,8 @@ def test_every_row_of_the_tables_has_its_three_jobs(monkeypatch):
         assert f"../../{result}" in rows
         for row in rows - {f"../../{result}"}:
             mine = [job for job in jobs if job.results == Path(f"results/memory/{name}/{row}")]
-            assert [job.args["seed"] for job in mine] == [1, 2, 3], (name, row)
+            published = (ROOT / "results" / "memory" / name / row / "seeds").glob("*.json")
+            assert [job.args["seed"] for job in mine] == sorted(int(path.stem) for path in published), (name, row)
             expected = {"memory_length": int(row.rpartition("_")[2]), observed: row.startswith("shown")}
             for job in mine:
                 assert job.args == {**shipped[result, job.args["seed"]], **expected}, shlex.join(job.command)
@@ -191,26 +193,31 @@ CHANGED = {
 }
 
 
-def rocket_jobs(tmp_path, name, begun=(), policies="nominal"):
-    """The jobs of a list in benchmarks/, policies that are not shipped replaced by the flags that they began with."""
-    text = (ROOT / "benchmarks" / name).read_text()
-    for row in begun:
-        flags = " ".join(
-            f"--{key.replace('_', '-')} {'' if value is True else value}" for key, value in CHANGED[row].items()
-        )
-        path = f"--checkpoint results/memory/{policies}/{row}/agent.safetensors"
-        assert path in text
-        text = text.replace(path, f"--env-id RocketAscentCutoff-v0 {flags}")
-    (tmp_path / name).write_text(text)
-    return run_seeds.read_jobs(tmp_path / name)
+SHIPPED = {"nominal": "results/rocket_cutoff", "rocket": "results/rocket_dispersed"}  # beside results/memory/<this>
 
 
-def test_the_rockets_rows_are_the_shipped_commands_but_for_what_they_say(tmp_path, monkeypatch):
-    """L_mem 32 is the front page's result, so each other row has to be its command with one thing changed."""
+@pytest.fixture
+def rocket_jobs(monkeypatch):
+    """The jobs of a list in benchmarks/. A policy of results/memory is not shipped; the shipped one stands in for it."""
     monkeypatch.chdir(ROOT)  # the shipped commands name the shipped policy
-    shipped = {(job.results.name, job.args["seed"]): job.args for job in rocket_jobs(tmp_path, "result_jobs.txt")}
-    nominal = rocket_jobs(tmp_path, "memory_nominal_jobs.txt")
-    dispersed = rocket_jobs(tmp_path, "memory_rocket_jobs.txt", begun=CHANGED)
+    read_policy = runs.read_policy
+
+    def read(path, *rest):
+        if Path(path).is_file():
+            return read_policy(path, *rest)
+        kind, row = Path(path).parts[-3:-1]
+        saved, decided = read_policy(f"{SHIPPED[kind]}/agent.safetensors", *rest)
+        return saved, decided | CHANGED[row]
+
+    monkeypatch.setattr(runs, "read_policy", read)
+    return lambda name: run_seeds.read_jobs(ROOT / "benchmarks" / name)
+
+
+def test_the_rockets_rows_are_the_shipped_commands_but_for_what_they_say(rocket_jobs):
+    """L_mem 32 is the front page's result, so each other row has to be its command with one thing changed."""
+    shipped = {(job.results.name, job.args["seed"]): job.args for job in rocket_jobs("result_jobs.txt")}
+    nominal = rocket_jobs("memory_nominal_jobs.txt")
+    dispersed = rocket_jobs("memory_rocket_jobs.txt")
     assert [job.args["seed"] for job in nominal + dispersed] == [1] * 6
     for result, experiment, jobs in (("rocket_cutoff", "nominal", nominal), ("rocket_dispersed", "rocket", dispersed)):
         rows = set(memory.EXPERIMENTS[experiment].rows)
@@ -221,12 +228,11 @@ def test_the_rockets_rows_are_the_shipped_commands_but_for_what_they_say(tmp_pat
             assert different == CHANGED[job.results.name], shlex.join(job.command)
 
 
-def test_rows_with_failures_are_the_shipped_command_but_for_what_they_say(tmp_path, monkeypatch):
-    monkeypatch.chdir(ROOT)
-    shipped = [job.args for job in rocket_jobs(tmp_path, "result_jobs.txt") if job.results.name == "rocket_failures"]
+def test_rows_with_failures_are_the_shipped_command_but_for_what_they_say(rocket_jobs):
+    shipped = [job.args for job in rocket_jobs("result_jobs.txt") if job.results.name == "rocket_failures"]
     assert [args["seed"] for args in shipped] == [1, 2, 3]
     rows = ("memory_0", "memory_1", "mlp")
-    jobs = rocket_jobs(tmp_path, "memory_failures_jobs.txt", begun=rows, policies="rocket")
+    jobs = rocket_jobs("memory_failures_jobs.txt")
     assert [job.args["seed"] for job in jobs] == [1, 2, 3, 1, 1, 2, 3]
     assert set(memory.EXPERIMENTS["failures"].rows) == {"../../rocket_failures", *rows}
     for job in jobs:
@@ -236,11 +242,9 @@ def test_rows_with_failures_are_the_shipped_command_but_for_what_they_say(tmp_pa
         assert different == CHANGED[job.results.name], shlex.join(job.command)
 
 
-def test_rows_with_noise_are_the_shipped_command_but_for_what_they_say(tmp_path, monkeypatch):
-    monkeypatch.chdir(ROOT)
-    (shipped, *_) = (j.args for j in rocket_jobs(tmp_path, "result_jobs.txt") if j.results.name == "rocket_dispersed")
-    name = "memory_navigation_jobs.txt"
-    without, own = rocket_jobs(tmp_path, name, begun=["memory_0"], policies="rocket")
+def test_rows_with_noise_are_the_shipped_command_but_for_what_they_say(rocket_jobs):
+    (shipped, *_) = (job.args for job in rocket_jobs("result_jobs.txt") if job.results.name == "rocket_dispersed")
+    without, own = rocket_jobs("memory_navigation_jobs.txt")
     for job, expected in ((without, CHANGED["memory_0"]), (own, {})):
         different = {name: value for name, value in job.args.items() if value != shipped[name]}
         different.pop("checkpoint", None)
