@@ -25,6 +25,7 @@ from __future__ import annotations
 
 import importlib
 import sys
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -167,14 +168,22 @@ for _problem in BUILT_IN:
     register_problem(_problem)
 
 
+OF_ANOTHER = ".* was another rocket's id"  # the warning of `register_rocket`
+
+
 def import_files_of(folder: str):
     """Run every file of a folder of tables. A file that fails is left out, with a line that says why."""
     for path in sorted(Path(__file__).parent.glob(f"{folder}/*.py")):
         try:
-            importlib.import_module(f"{folder}.{path.stem}")
+            with warnings.catch_warnings():
+                warnings.filterwarnings("error", message=OF_ANOTHER)
+                importlib.import_module(f"{folder}.{path.stem}")
         except BadInput as error:
             print(f"{folder}/{path.name} is left out: {error}", file=sys.stderr)
-        except Exception as error:  # a bad file must not stop the other files
+        except UserWarning as error:
+            env_id = str(error).split()[0]
+            print(f"{folder}/{path.name} is left out: another rocket has its id {env_id}, too", file=sys.stderr)
+        except (Exception, SystemExit) as error:  # a bad file must not stop the other files
             why = f"{type(error).__name__}: {error}"
             print(f"{folder}/{path.name} is left out: {why}", file=sys.stderr)
 

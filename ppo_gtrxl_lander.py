@@ -74,11 +74,11 @@ class Args:
     observe_velocity: bool = True  # show the velocity to the policy
     observe_command: bool = True  # show the last command to the policy
     observe_draw: bool = False  # show mass, gravity and failure to the policy, which no real flight could know
-    failure_probability: float | None = None  # probability of a hidden failure (none: the lander's)
-    failure_size: float | None = None  # a failure divides the thrust along one axis by this (none: the lander's)
+    failure_probability: float | None = None  # probability of a hidden failure (None: the lander's)
+    failure_size: float | None = None  # a failure divides the thrust along one axis by this (None: the lander's)
     failure_time: str = "start"  # when a failure strikes: at the "start" or at a "random" moment of the first 40 s
     decision_s: float = 0.2  # seconds between two commands of the policy, a multiple of 0.2
-    longest_flight: float | None = None  # seconds in which a flight has to land (none: the lander's)
+    longest_flight: float | None = None  # seconds in which a flight has to land (None: the lander's)
 
     # Table 1, the column of the rocket
     num_blocks: int = 6  # number of GTrXL blocks (0: a plain MLP, without memory)
@@ -101,7 +101,7 @@ class Args:
     num_minibatches: int = 8  # the number of mini-batches of whole episodes
     norm_adv: bool = True  # normalise the advantages over an update
     max_grad_norm: float = 0.5  # the maximum norm for the gradient clipping
-    target_kl: float | None = None  # the KL divergence from which an update takes no further step (none: no limit)
+    target_kl: float | None = None  # the KL divergence from which an update takes no further step (None: no limit)
     log_std: Schedule = -1.4  # log of the std in the action's unit. A number: learned from there; points: not learned
     memory_noise: Schedule = 0.1  # std of the memory before an episode (Algorithm 1, line 5; the text says "small")
     reward_scale: float = 0.2  # factor on the rewards in training; losses are logged with it, returns without
@@ -111,7 +111,7 @@ class Args:
     flights_per_start: Schedule = 1  # flights of each draw, compared with one another
     fuel_weight: Schedule = 1.0  # reward lost for 100 kg of propellant in training
     slope_weight: Schedule = 2.0  # weight of a flat last descent in training (`slope_reward` of landing/rewards.py)
-    training_failure_size: float | None = None  # --failure-size in training (none: the same)
+    training_failure_size: float | None = None  # --failure-size in training (None: the same)
     failure_emphasis: float = 1.0  # factor on --failure-probability in training
     failed_fuel_share: float = 1.0  # share of --fuel-weight that flights with a failure pay
     thrust_share: float = 1.0  # share of the greatest thrust that training may ask for

@@ -105,7 +105,7 @@ class Args:
     num_minibatches: int = 8  # the number of mini-batches of whole episodes
     norm_adv: bool = True  # normalise the advantages over an update
     max_grad_norm: float = 0.5  # the maximum norm for the gradient clipping
-    target_kl: float | None = None  # the KL divergence from which an update takes no further step (none: no limit)
+    target_kl: float | None = None  # the KL divergence from which an update takes no further step (None: no limit)
     log_std: Schedule = -1.4  # log of the std in the action's unit. A number: learned from there; points: not learned
     memory_noise: Schedule = 0.1  # std of the memory before an episode (Algorithm 1, line 5; the text says "small")
     reward_scale: float = 0.2  # factor on the rewards in training; losses are logged with it, returns without

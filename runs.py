@@ -85,7 +85,8 @@ Numbers = Annotated[
     ),
 ]
 RANGES = {  # lowest and highest value of every numeric flag; NaN and infinity are out of range
-    **dict.fromkeys(["seed", "eval_seed", "num_threads", "eval_every"], (0, 2**31 - 1)),
+    **dict.fromkeys(["seed", "eval_seed", "eval_every"], (0, 2**31 - 1)),
+    "num_threads": (0, 256),
     **dict.fromkeys(["total_updates", "num_envs", "num_minibatches", "update_epochs"], (1, 10**6)),
     **dict.fromkeys(["embed_dim", "num_heads", "mlp_dim", "hidden_dim"], (1, 8192)),
     **dict.fromkeys(["learning_rate", "clip_coef", "gamma", "gae_lambda", "memory_noise"], (0.0, 1.0)),

@@ -51,10 +51,11 @@ class BatchedEnv(Sealed, VectorEnv):
 
     A problem gives the spaces, `episode_steps` (of the longest episode) and three methods:
 
-    - `_start(mask, options)` puts the environments in `mask` at a start
+    - `_start(mask, options)` puts the environments in `mask` (N,) at a start
     - `_observe()` returns (N, obs) float64
-    - `_advance(actions)` flies one step and returns `(rewards (N,), terminated (N,), final)`; `final()` gives the
-      `final_info` arrays of the finished episodes, and is called only if there are any
+    - `_advance(actions)` flies one step, adds 1 to `self.t` (N,), the steps flown, and returns `(rewards (N,),
+      terminated (N,), final)`; `final()` gives the `final_info` arrays (N, ...) of the finished episodes, among them
+      `episodic_return`, and is called only if there are any
 
     A problem that can be rendered has `RENDERED` in its `metadata` and two more methods:
 
@@ -99,7 +100,8 @@ class BatchedEnv(Sealed, VectorEnv):
         self._waiting = np.zeros(num_envs, dtype=bool)  # with NextStep: the episodes that ended in the last step
         if render_mode not in (None, *self.metadata["render_modes"]):
             allowed = ", ".join(["None", *self.metadata["render_modes"]])
-            raise ValueError(f"render_mode is {render_mode!r}; it must be one of {allowed}")
+            wrong = ValueError if self.metadata["render_modes"] else TypeError  # Stable-Baselines3 then asks for none
+            raise wrong(f"render_mode is {render_mode!r}; it must be one of {allowed}")
         self.render_mode, self._sheet = render_mode, None
         self._trails = [[] for _ in range(num_envs)]  # the records of the running episodes, only with a render mode
         self.num_envs, self.episode_steps = num_envs, episode_steps

@@ -59,9 +59,7 @@ def check_numbers(problem):
         possible = is_finite(value) or is_tuple_of(is_finite, value) or (name == "u_min" and value is None)
         refuse(problem, possible, name, value, one_or_each)
     if problem.u_min is None:
-        refuse(
-            problem, all(np.atleast_1d(u_max) > 0), "u_max", u_max, "each number must be positive if u_min is not given"
-        )
+        refuse(problem, all(np.atleast_1d(u_max) > 0), "u_max", u_max, "must be positive if u_min is not given")
     else:
         alike = np.shape(problem.u_min) == np.shape(u_max)
         refuse(problem, alike, "u_min", problem.u_min, f"must have as many numbers as u_max {u_max}")
@@ -202,17 +200,34 @@ def try_functions(problem):
         name = "f" if phase.f is None else f"f of phase {k}"
         derivatives = attempt(problem, name, f, x, u)
         check_size(problem, name, derivatives, problem.states)
-        as_rows(problem, name, derivatives)
+        rows = as_rows(problem, name, derivatives)
+        check_alone(problem, name, phase.f or problem.f, (x, u), p, rows)
         for name, arguments in (("running", (x, u)), ("terminal", (x,)), ("end", (x,))):
             function = getattr(phase, name)
             if callable(function):
                 field = f"{name} of phase {k}"
                 value = attempt(problem, field, problem.with_parameters(function, p), *arguments)
                 rows = as_rows(problem, field, (value,))
+                check_alone(problem, field, function, arguments, p, rows)
                 above = name != "end" or k > 1 or (rows[0] >= 0).all()
                 allowed = "must not be below 0 at the starts: the phase ends when it falls through 0"
                 refuse_unless(above, f"{field} of {problem.env_id}", f"{np.min(rows[0]):.6g} at a start", allowed)
         check_step(problem, phase, x, u, p)
+
+
+def last_flight(value):
+    """The last entry of an array, or of each array of a tuple, as an array of one."""
+    return tuple(last_flight(entry) for entry in value) if isinstance(value, tuple) else read_only(value[-1:])
+
+
+def check_alone(problem, field: str, function: Callable, arguments, p, rows):
+    """Raise BadInput unless a function gives the last flight alone the same values as among the others."""
+    alone = problem.with_parameters(function, last_flight(p))
+    values = attempt(problem, field, alone, *(last_flight(argument) for argument in arguments))
+    again = as_rows(problem, field, values if isinstance(values, tuple) else (values,))
+    is_alone = all(np.allclose(row[-1], other, rtol=1e-9, atol=1e-12) for row, other in zip(rows, again))
+    allowed = "must depend on the flight's own x and u: each of them holds one entry a flight, so index none of them"
+    refuse_unless(is_alone, f"what {field} of {problem.env_id} returns", "mixed over the flights, or random", allowed)
 
 
 def check_step(problem, phase, x, u, p):

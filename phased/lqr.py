@@ -57,13 +57,21 @@ def riccati(problem: Problem):
         for t in reversed(range(end - phase.steps, end)):
             weight = R + B.T @ P[t + 1] @ B
             ahead = P[t + 1] @ drift + p
-            K[t] = np.linalg.solve(weight, B.T @ P[t + 1] @ A)
-            k[t] = np.linalg.solve(weight, B.T @ ahead)
+            K[t] = solved(weight, B.T @ P[t + 1] @ A)
+            k[t] = solved(weight, B.T @ ahead)
             P[t] = np.diag(problem.state_weights(phase)) + A.T @ P[t + 1] @ (A - B @ K[t])
             p = (A - B @ K[t]).T @ ahead
         end -= phase.steps
         next_target = target
     return K, k, P
+
+
+def solved(weight: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """weight^-1 right, or the least solution where a control neither costs nor changes anything that does."""
+    try:
+        return np.linalg.solve(weight, right)
+    except np.linalg.LinAlgError:
+        return np.linalg.pinv(weight) @ right
 
 
 def point_of(problem: Problem, phase: Phase) -> np.ndarray:

@@ -110,7 +110,7 @@ def test_bad_folders_are_one_line_and_write_nothing(fault, tmp_path, monkeypatch
     else:
         arrays["y_reference"][3, 2] = np.nan
         np.savez(folder / "eval.npz", **arrays)
-    words = {"no folder": "eval.json", "no npz": "eval.npz", "other id": "env_id must be", "short": r"u \(456, 3\)"}
+    words = {"no folder": "eval.json", "no npz": "eval.npz", "other id": "env_id is 'Cart", "short": r"u \(456, 3\)"}
     with pytest.raises(SystemExit, match=words.get(fault, "the optimum's flight holds a NaN")) as refusal:
         command_line(monkeypatch, "animate", folder)
     assert str(refusal.value).startswith("evaluate.py: ") and "\n" not in str(refusal.value)

@@ -198,7 +198,7 @@ SHIPPED = {"nominal": "results/rocket_cutoff", "rocket": "results/rocket_dispers
 
 @pytest.fixture
 def rocket_jobs(monkeypatch):
-    """The jobs of a list in benchmarks/. A policy of results/memory is not shipped; the shipped one stands in for it."""
+    """The jobs of a list in benchmarks/. For a policy of results/memory the shipped one stands in."""
     monkeypatch.chdir(ROOT)  # the shipped commands name the shipped policy
     read_policy = runs.read_policy
 

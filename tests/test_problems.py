@@ -474,6 +474,8 @@ SLIPS = {
     "four states": ({"f": lambda x, u: (x[2], x[3], u, u), "x_max": (10.0,) * 4}, "target of phase 1"),
     "one derivative": ({"f": lambda x, u: (x[1],)}, "the number of what f returns"),
     "no tuple": ({"f": lambda x, u: x[1]}, "what f returns"),
+    "control of the first flight": ({"f": lambda x, u: (x[1], u[0] - x[0])}, "what f of .* mixed over the flights"),
+    "mean of the flights": (phase(running=lambda x, u: np.mean(x[0]) ** 2), "what running of phase 1 .* mixed over"),
     "one guess for two controls": (
         {"f": lambda x, u: (x[1], u[0] + u[1]), "u_max": (1.0, 1.0), "guess": lambda x: (-x[0],)},
         "the number of what guess returns",

@@ -6,7 +6,6 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import run_seeds
@@ -109,8 +108,8 @@ class Trained:
     def is_trained(self):
         return self.trained
 
-    def run_dir(self):
-        return None
+    def identity(self):
+        return self.command
 
     def start(self):
         return subprocess.Popen([sys.executable, "-c", ""])
@@ -140,10 +139,10 @@ def test_what_cannot_be_published_fails_alone(capsys, trained):
 
 def test_two_jobs_never_go_on_with_one_run():
     """A folder of its own does not make a job another run: it waits for the one with its arguments."""
-    here, there, new = (SimpleNamespace(run_dir=lambda run=run: run) for run in ("runs/a", "runs/b", None))
-    again = SimpleNamespace(run_dir=lambda: "runs/a")
+    here, there = (run_seeds.Job(Path("results/a"), [], {"seed": seed}) for seed in (1, 2))
+    again = run_seeds.Job(Path("results/b"), [], {"seed": 1, "num_threads": 2})
     assert run_seeds.next_free([again, there], [here]) is there and run_seeds.next_free([again], [there]) is again
-    assert run_seeds.next_free([again], [here, there]) is None and run_seeds.next_free([new], [here, new]) is new
+    assert run_seeds.next_free([again], [here, there]) is None
 
 
 @pytest.mark.parametrize("seed, replaces", [(1, True), (2, False)])
