@@ -63,11 +63,13 @@ def test_a_shorter_policy_flies_the_starts_of_its_run(tmp_path, monkeypatch):
     run = tmp_path / "run"
     run.mkdir()
     shutil.copy(ROOT / "results" / "rocket_cutoff" / "agent.safetensors", run)
-    held_out = lambda *words, **flag: {"args": {"eval_seed": 273427, "eval_starts": 7}}  # noqa: E731
+    flags = {"eval_seed": 273427, "eval_starts": 7, "dispersion": 1.0, "failure": 0.2, "navigation_noise": [10.0, 0.1]}
+    held_out = lambda *words, **flag: {"args": flags}  # noqa: E731
     monkeypatch.setattr(evaluate, "read_checkpoint", held_out)
     flown = []
     refused = types.SimpleNamespace(returncode=1, stderr="not flown")
     monkeypatch.setattr(evaluate.subprocess, "run", lambda command, **streams: flown.extend(command) or refused)
     with pytest.raises(ValueError, match="not flown"):
         evaluate.shorten(run)
-    assert "--eval-seed=273427" in flown and "--eval-starts=7" in flown
+    assert {"--eval-seed=273427", "--eval-starts=7", "--dispersion=1.0", "--failure=0.2"} <= set(flown)
+    assert "--navigation-noise=10.0 0.1" in flown

@@ -177,6 +177,8 @@ def test_cost_parts_equal_the_environments(env_id):
 def test_ten_start_statistic_is_the_papers():
     rng = np.random.default_rng(0)
     cost, optimum = rng.uniform(2, 3, (2, 40))
+    gain = ratio_metrics(np.array([-8.0, -12.0]), np.array([-10.0, -12.0]), 0)  # of Goddard's rocket: less is worse
+    assert gain["ratio_max"] == pytest.approx(1.2) and gain["ratio_of_sums"] == pytest.approx(1 + 2 / 22)
     metrics = ratio_metrics(cost, optimum, eval_seed=9)
     rng, means = np.random.default_rng([9, 1]), []
     for _ in range(100):

@@ -1,5 +1,7 @@
 """The landers' environment against an integrator, printed rows, and flights that can be computed by hand."""
 
+import math
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -351,3 +353,54 @@ def test_a_slip_in_a_lander_is_one_line(name):
 def test_an_id_that_is_taken_is_refused():
     with pytest.raises(BadInput, match="MarsLanding-v0"):
         envs.register_lander("MarsLanding-v0", MARS)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Rewards
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def test_rewards_and_return_by_hand():
+    """One flight touches down, one ends in the air: propellant, the last step, and the return with the fixed scales."""
+    batch = gym.make_vec(ID, num_envs=2, longest_flight=8.0).unwrapped
+    prices = {"fuel_price": 3.0, "aloft_price": 7.0, "slope_price": 1.5}
+    scales = {"sink_rate": 0.8, "position_scale": 0.5, "speed_scale": 0.4}
+    for name, value in (prices | scales).items():
+        setattr(batch, name, value)
+    batch.reset(options={"draw": np.repeat(MIDDLE, 2, 0), "x0": [[9, 2, 30, -0.8, 0.1, -6], [300, 0, 900, 1, 2, -3]]})
+
+    def of_miss(r, v, position_scale, speed_scale):
+        far, fast = np.linalg.norm(r), np.linalg.norm(v)
+        return -math.log(1 + far / position_scale) - math.log(1 + fast / speed_scale) - far / 20 - fast / 5
+
+    ended = np.zeros(2, dtype=bool)
+    while not ended.all():
+        mass, flies = batch.mass.copy(), ~ended
+        _, reward, ended, final = batch.advance(np.tile([0, 0, 0.3], (2, 1)))
+        expected = -3 * (mass - batch.mass) / 100
+        for k in np.flatnonzero(ended & flies):
+            r, v = np.split(final["final_y"][k, :6], 2)
+            flat = math.log(max(20 / max(final["slope"][k], 0.05), 1))
+            expected[k] += -1.5 * flat if final["down"][k] else -7
+            expected[k] += of_miss(r, v + [0, 0, 0.8], 0.5, 0.4)
+            as_evaluated = (-2 * flat if final["down"][k] else -10) + of_miss(r, v, 0.1, 0.1)
+            assert final["episodic_return"][k] == pytest.approx(as_evaluated - final["fuel_kg"][k] / 100)
+        assert reward[flies] == pytest.approx(expected[flies], rel=1e-12)
+    assert final["down"].tolist() == [True, False]
+
+
+def test_a_landing_needs_every_condition():
+    good = {"position_error": 4.9, "speed": 1.9, "slope": 5.1, "is_down": True}
+    assert has_landed(**good)
+    for name, value in (("position_error", 5.1), ("speed", 2.1), ("slope", 4.9), ("is_down", False)):
+        assert not has_landed(**good | {name: value}), name
+
+
+def test_the_published_end_stops_a_flight_that_leaves():
+    """500 m farther from the pad than at its least."""
+    batch = gym.make_vec(ID, num_envs=1, published_end=True).unwrapped
+    batch.reset(options={"draw": MIDDLE, "x0": [[0, 0, 100, 0, 0, 50]]})
+    ended = np.zeros(1, dtype=bool)
+    while not ended.all():
+        _, _, ended, final = batch.advance(np.array([[0.0, 0.0, 1.0]]))
+    assert not final["down"][0] and 600 < final["position_error"][0] < 650

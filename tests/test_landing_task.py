@@ -3,10 +3,12 @@
 import dataclasses
 import importlib
 import json
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from attention import load
 
 import envs
 import evaluate
@@ -14,7 +16,8 @@ from common.evaluations import read_evaluation
 from common.tasks import task_of
 from landing.environment import LanderVectorEnv, fly_lander
 from landing.lander import LANDERS
-from landing.metrics import KEPT_FLIGHTS, draws, flight_metrics, fly_draws
+from landing.metrics import KEPT_FLIGHTS, draws, evaluate_policy, flight_metrics, fly_draws
+from landing.optimum import references
 from landing.task import held
 
 ID = "MarsLanding-v0"
@@ -80,7 +83,7 @@ def test_recorded_flights_can_be_flown_again():
         assert np.concatenate([r, v, m]) == pytest.approx(flown["final_y"][k], abs=1e-4)
 
 
-def test_the_optimum_lands_on_less_than_any_policy():
+def test_the_optimum_lands_and_a_policy_is_measured_beside_it():
     task = task_of(ID)
     reference = task.optimum(3, 4)
     assert reference["solved"].all() and reference["down"].all()
@@ -94,9 +97,51 @@ def test_the_optimum_lands_on_less_than_any_policy():
     assert again["final_y"] == pytest.approx(arrays["final_y"])
 
 
+def test_the_fuel_ratio_is_of_the_solved_draws():
+    solved = {"solved": np.array([True, False, True]), "fuel_kg": np.array([20.0, np.nan, 70.0])}
+    solved |= {"final_time": np.ones(3), "episodic_return": np.ones(3), "y": np.zeros((3, 2, 7))}
+    fuel = fly_draws(ID, lambda z: falls, draws(4, 4))["fuel_kg"]
+    metrics, _ = evaluate_policy(ID, falls, solved, 4, 4)
+    assert metrics["fuel_ratio"] == pytest.approx((fuel[0] + fuel[2]) / 90)
+
+
+def test_the_optima_are_of_the_evaluations_draws():
+    """The draws of seed 3 as README of results/ can make them: numbers of NumPy's generator of [3, 3]."""
+    z = np.random.default_rng([3, 3]).random((2, 13))
+    np.testing.assert_array_equal(draws(3, 2), z)
+    np.testing.assert_array_equal(task_of(ID).optimum(3, 2)["fuel_kg"], references(ID, z)["fuel_kg"])
+    np.testing.assert_array_equal(task_of(ID).reset_options(3, 2)["draw"], z)
+
+
+def test_the_shipped_policy_flies_as_it_did():
+    folder = Path(script.__file__).parent / "results" / "mars_landing"
+    agent, args, options = load(folder / "agent.safetensors")
+    with np.load(folder / "eval.npz") as file:
+        z, ends = file["draw"], file["final_y"]
+    np.testing.assert_array_equal(z, draws(0, len(z)))
+    steps = gym.make_vec(ID, num_envs=1, **options).unwrapped.episode_steps
+    flown = fly_lander(ID, agent.make_policy(steps), z, **options)
+    np.testing.assert_allclose(flown["final_y"], ends, atol=0.02)
+
+
+def test_the_curriculum_of_our_recipe():
+    """At its points: the scales follow the noise, commands are held for 1 s and at the end for 0.4 s."""
+    args = script.Args(**script.MARS)
+    batch = gym.make_vec(ID, num_envs=1536, decision_s=args.decision_s, longest_flight=args.longest_flight).unwrapped
+    for progress, log_std, hold, fuel, slope in ((0, -1, 1.0, 4, 0), (0.6, -2.5, 1.0, 12, 1), (1, -3.6, 0.4, 12, 2)):
+        script.set_curriculum(batch, args, progress)
+        std = np.exp(log_std)
+        assert batch.position_scale == pytest.approx(max(30 * std, 0.1))
+        assert batch.speed_scale == pytest.approx(max(10 * std, 0.1))
+        assert batch.decision_s == pytest.approx(hold)
+        assert (batch.fuel_price, batch.slope_price) == (pytest.approx(fuel), pytest.approx(slope))
+    assert (batch.thrust_share, batch.start_spread, batch.wind, batch.failed_fuel_share) == (0.8, 1.9, 0.7, 0.3)
+    assert (batch.sink_rate, batch.aloft_price, batch.slope_height) == (0.8, 20.0, 10.0)
+
+
 def test_the_script_trains_evaluates_and_publishes(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    argv = ["--total-updates=2", "--num-envs=4", "--eval-every=0", "--eval-starts=10", "--failure-time=random"]
+    argv = ["--total-updates=2", "--num-envs=4", "--eval-every=1", "--eval-starts=10", "--failure-time=random"]
     script.main(argv)
     (run,) = (tmp_path / "runs").iterdir()
     metrics, arrays = read_evaluation(run)

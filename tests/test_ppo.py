@@ -575,6 +575,20 @@ def test_target_kl_ends_the_update_at_once(learner, target_kl, steps):
     assert len(run.optimizer.weights) == steps
 
 
+def test_a_minibatch_beyond_the_limit_ends_the_update(learner, monkeypatch):
+    """Also if the next ones would be within it."""
+    run, loss = learner((6, 2, 5, 1), target_kl=0.5, update_epochs=5), script.ppo_loss
+    kls = iter([0.0, 0.7, *[0.0] * 8])
+
+    def prescribed(*arguments):
+        total, losses = loss(*arguments)
+        return total, {**losses, "approx_kl": torch.tensor(next(kls))}
+
+    monkeypatch.setattr(script, "ppo_loss", prescribed)
+    run.update()
+    assert len(run.optimizer.weights) == 1
+
+
 def test_nan_reward_stops_before_the_weights_move(learner):
     run = learner()
     run.batch.rewards[2, 0] = torch.nan
