@@ -136,20 +136,20 @@ def test_crashes_are_counted_and_leave_no_gap():
 
 
 def test_only_closed_orbits_have_elements():
-    """Two ellipses by hand, one of them dry, a hyperbola and a crash: the errors and masses are of all four."""
+    """Two ellipses by hand, both dry, a hyperbola and a crash: the errors and masses are of all four."""
     rocket, n = envs.ROCKET, 4
     perigee, apogee = 6378.145 + np.array([180.0, 190.0]), 6378.145 + np.array([35000.0, 37000.0])
     a = np.array([*(perigee + apogee) / 2, -2e4, 7e3])
     flights = {"a_km": a, "e": np.array([*(apogee - perigee) / (apogee + perigee), 1.5, 0.1])}
     flights |= {"i_deg": np.array([28.6, 28.4, 60.0, 5.0]), "error_norm": np.array([0.001, 0.002, 1.5, 1.0])}
     flights |= {"raan_deg": np.full(n, rocket.raan), "argp_deg": np.full(n, rocket.argp)}
-    flights |= {"dry": np.array([0, 1, 0, 1], bool), "crashed": np.array([0, 0, 0, 1], bool)}
+    flights |= {"dry": np.array([1, 1, 0, 1], bool), "crashed": np.array([0, 0, 0, 1], bool)}
     metrics = dispersed_metrics(flights | {"final_mass_kg": np.array([7e3, 8e3, 9e3, 1e4])}, rocket)
     target = rocket.a / 1e3 * (1 - rocket.e) - rocket.Re / 1e3
     assert metrics["dispersed_perigee_error_mean_km"] == pytest.approx(185 - target)
     assert metrics["dispersed_perigee_error_std_km"] == pytest.approx(5.0)
     assert metrics["dispersed_i_error_mean_deg"] == pytest.approx(0.0, abs=1e-12)
-    assert (metrics["dispersed_dry"], metrics["dispersed_crashed"], metrics["dispersed_mass_mean_kg"]) == (2, 1, 8500)
+    assert (metrics["dispersed_dry"], metrics["dispersed_crashed"], metrics["dispersed_mass_mean_kg"]) == (3, 1, 8500)
     assert metrics["dispersed_error_max"] == 1.5
     assert metrics["dispersed_error_p99"] == pytest.approx(1.0 + 0.97 * 0.5)  # of 0.001, 0.002, 1, 1.5
 

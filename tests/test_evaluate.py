@@ -560,6 +560,12 @@ def test_a_results_folder_keeps_the_first_thirty_starts(tmp_path, monkeypatch):
             np.testing.assert_array_equal(kept[key], array if key == "t" else array[:30])
 
 
+def test_numbers_alone_keep_the_curve_of_the_evaluations(tmp_path):
+    evaluate.publish(make_run(tmp_path / "run"), tmp_path / "results", numbers=True)
+    curve = read_csv(tmp_path / "results" / "seeds" / "1.csv")
+    assert curve["charts/episodic_return"][0].tolist() == [40_000, 80_000, 120_000]
+
+
 def test_seeds_alone_say_of_which_problem_a_folder_is(tmp_path):
     run, other = make_run(tmp_path / "a", seed=1), tmp_path / "results" / "seeds" / "2.json"
     other.parent.mkdir(parents=True)

@@ -328,6 +328,9 @@ def test_no_flight_ends_heavier_than_the_optimum_that_knows(flown):
     close = has_failed & (errors < 5e-3)
     short = (known.mass_at(arrays["final_error"], ROCKET) - arrays["final_y"][:, 6])[close]
     assert close.sum() > 2 and short.min() > -0.5 and metrics["failure_mass_short_mean_kg"] > 0
+    saved = has_failed & (known.mass > dry_mass) & (errors < 0.02)
+    short = (known.mass_at(arrays["final_error"], ROCKET) - arrays["final_y"][:, 6])[saved]
+    assert metrics["failure_mass_short_mean_kg"] == pytest.approx(short.mean(), rel=1e-9)
 
 
 @pytest.mark.slow
