@@ -53,6 +53,9 @@ class Lander:
         allowed = f"must be at least its least_thrust, {self.least_thrust} N"
         possible = self.greatest_thrust >= self.least_thrust
         refuse_unless(possible, "a lander's greatest_thrust", self.greatest_thrust, allowed)
+        weight = self.dry_mass * self.gravity
+        allowed = f"must be above the weight of its dry mass, {weight:.0f} N, or it cannot brake"
+        refuse_unless(self.greatest_thrust > weight, "a lander's greatest_thrust", self.greatest_thrust, allowed)
         refuse_unless(0 <= self.cant < 90, "a lander's cant", self.cant, "must be from 0 to below 90 degrees")
         check_failure(self.failure_probability, self.failure_size)
         for name in ("start", "spread"):

@@ -284,7 +284,8 @@ def solve_from_guess(
     solution = solve(x0=np.concatenate(unknowns), p=np.concatenate(parameters), **bounds)
     status = solve.stats()["return_status"]
     if status != "Solve_Succeeded":
-        raise NoOptimum(f"landing: IPOPT stopped with {status}")
+        causes = "greatest_thrust too small, start too low or too fast, or too little propellant (mass, dry_mass)"
+        raise NoOptimum(f"landing: IPOPT stopped with {status}; it may be {causes}")
     found = solution["x"].full()[:, 0]
     thrust = found[: 3 * count].reshape(count, 3) * lander.greatest_thrust
     y = np.vstack([descent.state, found[3 * count : -1].reshape(count, 7) * UNITS])

@@ -123,6 +123,21 @@ def test_phases_begin_where_the_event_was(new_problem):
     assert seen[-1][-2] == pytest.approx(falls / 4.2)  # tau: the time over the longest
 
 
+def test_flights_in_different_phases_fly_as_alone(new_problem):
+    """Three fall to 5 m from other heights, so at one step some fall and some drift."""
+    phases = (
+        Phase(steps=40, end=lambda x: x[0] - 5.0),
+        Phase(steps=9, f=lambda x, u: (x[1], 0.0 * u), target=(5.0, None), radius=100.0, terminal=lambda x: x[0]),
+    )
+    env_id = new_problem(free_fall("Apart-v0", phases=phases, x0_max=0.0))
+    x0 = np.array([[6.0, 0.0], [12.0, 0.0], [9.0, 0.0]])
+    together = fly(env_id, hold(0.0), x0)
+    for k in range(3):
+        alone = fly(env_id, hold(0.0), x0[k : k + 1])
+        np.testing.assert_allclose(together["x"][k], alone["x"][0], rtol=1e-12)
+        assert together["cost"][k] == pytest.approx(alone["cost"][0], rel=1e-12)
+
+
 def test_weights_count_in_proportion_to_a_step_that_is_cut(new_problem):
     phase = Phase(steps=40, end=lambda x: x[0], target=(0.0, 0.0), Q=(1.0, 0.0), R=2.0)
     env_id = new_problem(free_fall("Share-v0", phases=(phase,), x0_max=0.0))

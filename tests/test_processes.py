@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -257,6 +258,17 @@ def test_torchrun_death_and_resume(tmp_path):
     assert len(whole["rng"]) == 2 and not torch.equal(whole["rng"][0]["torch"], whole["rng"][1]["torch"])
     with pytest.raises(SystemExit, match="it was trained by 2 processes"):
         script.main([f"--resume={run}"])
+
+
+def test_processes_draw_other_noise(monkeypatch):
+    """With the weights of one seed: the first process goes on with its own generator, the second takes another seed."""
+    drawn = []
+    for rank in (0, 1):
+        monkeypatch.setattr(runs, "rank_and_world_size", lambda rank=rank: (rank, 2))
+        torch.manual_seed(1)
+        runs.Run(script.Args(seed=1), None, None, None, None, SimpleNamespace(episode_steps=50), {}, None)
+        drawn.append(torch.randn(5))
+    assert not (drawn[0] == drawn[1]).any()
 
 
 def parse(*argv):

@@ -182,6 +182,21 @@ def test_a_recipe_is_what_no_flag_sets(script, env_id):
     assert typed.total_updates == changes["total_updates"]
 
 
+@pytest.mark.parametrize("script", [DI, VDP, ROCKET])
+def test_the_optimiser_is_cleanrls_adam(script, monkeypatch, tmp_path):
+    """Adam with epsilon 1e-5; its learning rate is set by `train`."""
+    monkeypatch.chdir(tmp_path)
+    optimizers = []
+    monkeypatch.setattr(script, "train", lambda args, agent, average, optimizer, *rest: optimizers.append(optimizer))
+    monkeypatch.setattr(runs.Run, "__enter__", lambda run: run)
+    monkeypatch.setattr(runs.Run, "__exit__", lambda run, *error: None)
+    monkeypatch.setattr(runs.Run, "finish", lambda run: None)
+    script.main(["--embed-dim=8", "--num-heads=2", "--num-envs=2", "--num-minibatches=1", "--flights-per-start=1"])
+    (optimizer,) = optimizers
+    assert type(optimizer) is torch.optim.Adam
+    assert (optimizer.defaults["eps"], optimizer.defaults["betas"]) == (1e-5, (0.9, 0.999))
+
+
 def test_an_id_without_a_recipe_takes_its_familys(monkeypatch, capsys):
     """A vehicle that somebody registers: with cut-off as our cut-off rocket, else as our 961 s one."""
     for like in ("RocketAscentCutoff-v0", "RocketAscent-v0"):
