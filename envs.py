@@ -182,7 +182,10 @@ def import_files_of(folder: str):
             print(f"{folder}/{path.name} is left out: {error}", file=sys.stderr)
         except UserWarning as error:
             env_id = str(error).split()[0]
-            print(f"{folder}/{path.name} is left out: another rocket has its id {env_id}, too", file=sys.stderr)
+            print(
+                f"{folder}/{path.name} is left out: env_id is {env_id!r}, another rocket's; it must be new",
+                file=sys.stderr,
+            )
         except (Exception, SystemExit) as error:  # a bad file must not stop the other files
             why = f"{type(error).__name__}: {error}"
             print(f"{folder}/{path.name} is left out: {why}", file=sys.stderr)

@@ -518,7 +518,7 @@ def train(name: str, seed: int, curve: Curve):
 def evaluated(row: Row, agent) -> dict:
     """The metrics of the mean action in float32, on the flights on which every other row is evaluated."""
     task = task_of(row.env_id)
-    (env, options) = make_envs(row, 1, 1)
+    env, options = make_envs(row, 1, 1)
     policy = agent.float().make_policy(env.episode_steps)
     n = task.default_flights(is_brief=False, **options)
     metrics, _ = evaluate.evaluate(row.env_id, policy, 0, n, **options)

@@ -23,7 +23,7 @@ def trajectories_figure(problem: Problem, arrays: dict, title: str) -> Figure:
     if problem.states != 2 or problem.controls != 1 or problem.has_events:
         return time_figure(problem, arrays, title)
     t = arrays["t"]
-    (position_name, velocity_name) = problem.state_labels
+    position_name, velocity_name = problem.state_labels
     figure = Figure(figsize=(11, 8.5), layout="constrained")
     (plane, position), (velocity, control) = figure.subplots(2, 2)
     for suffix, style in (("", POLICY), ("_reference", OPTIMUM)):
@@ -151,8 +151,8 @@ def add_legend(figure: Figure, problem: Problem):
     """One legend for all panels, below them."""
     handles = [Line2D([], [], **POLICY, label="policy"), Line2D([], [], **OPTIMUM, label="optimum")]
     radii = dict.fromkeys(str(phase.radius) for phase in problem.phases if phase.has_circle)
-    if radii:
-        label = f"target (radius {', '.join(radii)})"
+    if any(phase.target is not None for phase in problem.phases):
+        label = f"target (radius {', '.join(radii)})" if radii else "target"
         handles.append(Line2D([], [], **TARGET, linestyle="--", marker="o", fillstyle="none", label=label))
     handles.append(Line2D([], [], color="k", marker=".", linestyle="", label="start"))
     if problem.waypoints:

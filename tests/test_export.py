@@ -383,6 +383,16 @@ def test_czml_shows_the_flight(tmp_path):
         ),
         ("di", [], "evaluate.py: nothing to export: name a file by --onnx, --csv, --flights, --oem, --czml"),
         ("di", ["--csv={}", "--flights={}"], "evaluate.py: two of the flags name one file"),
+        (
+            "rocket_cutoff",
+            ["--csv={}", "--epoch=2027-01-01"],
+            "evaluate.py: --epoch is 2027-01-01T00:00:00Z; it needs --oem or --czml",
+        ),
+        (
+            "rocket_cutoff",
+            ["--czml={}", "--epoch=9999-12-31"],
+            "error: argument --epoch: '9999-12-31' must be a moment",
+        ),
         ("memory", ["--csv={}"], "evaluate.py: [Errno 2] No such file or directory"),
         ("memory", ["--onnx={}"], "evaluate.py: "),
         ("rocket_cutoff", ["--czml={}", "--epoch=tomorrow"], "error: argument --epoch: 'tomorrow' must be a moment"),

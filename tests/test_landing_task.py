@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from attention import load
 
+import baselines
 import envs
 import evaluate
 from common.evaluations import read_evaluation
@@ -95,6 +96,15 @@ def test_the_optimum_lands_and_a_policy_is_measured_beside_it():
     assert task.required_arrays(metrics) <= arrays.keys()
     again = fly_lander(ID, held(arrays["u"], envs.MARS), draws(3, 10))
     assert again["final_y"] == pytest.approx(arrays["final_y"])
+
+
+@pytest.mark.parametrize("flag", ["--starts=3", "--seed=7"])
+def test_a_lander_of_one_start_takes_no_draws(flag, monkeypatch):
+    monkeypatch.setattr("landing.task.report_lander", None)  # nothing is solved
+    monkeypatch.setattr("sys.argv", ["baselines.py", "PoweredDescent-v0", flag])
+    name, value = flag.split("=")
+    with pytest.raises(SystemExit, match=f"^error: {name} is {value}; it must be left out: PoweredDescent-v0 has one"):
+        baselines.main()
 
 
 def test_the_fuel_ratio_is_of_the_solved_draws():

@@ -202,6 +202,16 @@ def test_two_controls_with_the_papers_costs(new_problem):
     assert numbers["collocation_flown_ratio_of_sums"] == pytest.approx(1.0, abs=0.05)
 
 
+def test_a_control_that_costs_nothing_and_changes_no_cost(new_problem):
+    """The last step's control moves what no weight sees any more; LQR leaves it at 0."""
+    problem = Problem("Free-v0", lambda x, u: (x[1], u), 50.0, (Phase(steps=20, target=(0.0, 0.0)),), (9.0, 9.0))
+    x0 = np.array([[0.3, 0.1]])
+    env_id = new_problem(problem)
+    numbers = baselines.compare_single_phase(env_id, x0, baselines.reference(env_id, x0))
+    assert numbers["lqr_ratio_of_sums"] == pytest.approx(1.0, abs=1e-6)
+    assert fly(env_id, baselines.lqr_policy(problem), x0)["u"][0, -1] == 0
+
+
 def drawn(env_id):
     """A wind that is drawn and hidden, and a start that depends on the same scores."""
     return Problem(

@@ -350,14 +350,19 @@ def test_a_bad_file_of_vehicles_is_left_out_with_a_line(tmp_path):
     (tmp_path / "vehicles" / "a_bad_one.py").write_text(good.replace("payload=20e3", "payload=-20e3"))
     (tmp_path / "vehicles" / "b_foreign.py").write_text(good.replace("TwoStageLEO-v0", "VanDerPol-v0"))
     (tmp_path / "vehicles" / "c_broken.py").write_text(good.replace("payload=20e3", "payload=heavy"))
+    (tmp_path / "vehicles" / "d_ends.py").write_text("raise SystemExit(2)\n")
     (tmp_path / "vehicles" / "z_good.py").write_text(good)
+    (tmp_path / "vehicles" / "zz_copy.py").write_text(good.replace("payload=20e3", "payload=19e3"))
     code = "import envs, gymnasium; print(*envs.ROCKETS); print(gymnasium.make('TwoStageLEO-v0').reset()[0][6])"
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=60)
     assert done.stdout.split() == [FIXED, CUTOFF, LEO, "564500.0"]
-    first, second, third = done.stderr.splitlines()
+    first, second, third, fourth, copy = done.stderr.splitlines()
     assert first == "vehicles/a_bad_one.py is left out: a rocket's payload is -20000.0; it must not be negative"
     assert second.startswith("vehicles/b_foreign.py is left out: env_id is 'VanDerPol-v0'")
     assert third == "vehicles/c_broken.py is left out: NameError: name 'heavy' is not defined"
+    assert fourth == "vehicles/d_ends.py is left out: SystemExit: 2"
+    allowed = "env_id is 'TwoStageLEO-v0', another rocket's; it must be new"
+    assert copy == f"vehicles/zz_copy.py is left out: {allowed}"
 
 
 # --- one burn, three burns, another site and target -------------------------------------------------------------------
