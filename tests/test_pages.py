@@ -22,6 +22,7 @@ from attention import load  # noqa: E402
 from helpers import save  # noqa: E402
 from page_flights import CHANGED, NO_CHANGES, Engine  # noqa: E402
 
+import baselines  # noqa: E402
 import evaluate  # noqa: E402
 import ppo_gtrxl_di  # noqa: E402
 import ppo_gtrxl_rocket  # noqa: E402
@@ -255,6 +256,20 @@ def test_policy_and_optimum_from_given_starts(result):
             np.testing.assert_allclose(flight["x"], arrays[f"x{suffix}"][k], atol=1e-6)
             assert all(flight["hits"])
     assert all(policy["cost"] > optimum["cost"] for policy, optimum in zip(policies, optima))
+
+
+@pytest.mark.slow
+def test_the_optimum_of_a_table_in_which_one_phase_has_no_circle(new_problem):
+    """The page's, and IPOPT's of the same table."""
+    waypoints = PROBLEMS["DoubleIntegratorWaypoints-v0"]
+    first = replace(waypoints.phases[0], radius=math.inf, bonus=0.0)
+    table = replace(waypoints, env_id="OneCircle-v0", phases=(first, *waypoints.phases[1:]))
+    x0 = np.array([[0.6, -0.4]])
+    optimum = baselines.reference(new_problem(table), x0)
+    opened = "Object.assign(data.problem.phases[0], {radius: null, bonus: 0})"
+    flight = engine_of("di_waypoints")(f"({opened}, planeOptimum(data.problem, {x0[0].tolist()}))")
+    assert flight["hits"][1] and optimum["hit"][0, 1]
+    assert flight["cost"] == pytest.approx(optimum["cost"][0], abs=1e-5)
 
 
 RANDOM_PLANES = [
