@@ -40,7 +40,7 @@ def load(checkpoint):
     script = next((script for script in SCRIPTS if env_id in script.ENV_IDS), None)
     refuse_unless(script, f"env_id of {checkpoint}", env_id, "must be one that a script trains")
     argv = ["--eval-only", "--checkpoint", str(checkpoint)]
-    args, saved = runs.parse_args(script.Args, script.recipe, argv, script.ENV_OPTIONS, script.BUFFERS)
+    args, saved = runs.parse_args(script, argv)
     args.dispersion = saved["args"].get("dispersion", 0.0)
     options = {name: getattr(args, name) for name in script.ENV_OPTIONS} | script.FIXED_OPTIONS
     agent = script.Agent(args, gym.make_vec(env_id, num_envs=1, **options))

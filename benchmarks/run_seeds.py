@@ -24,7 +24,7 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -33,6 +33,7 @@ import evaluate  # noqa: E402
 import runs  # noqa: E402
 from common.command_line import OneLineParser, integer  # noqa: E402
 from common.evaluations import read_json  # noqa: E402
+from common.flags import plain_args  # noqa: E402
 
 SCRIPTS = sorted(path.name for path in ROOT.glob("ppo_gtrxl_*.py"))
 MACHINE = ("cuda", "num_threads", "resume")  # arguments that another start may change
@@ -140,10 +141,10 @@ def read_job(words):
     kind = importlib.import_module(Path(script).stem)
     if {"--help", "-h"} & set(flags):
         raise ValueError("--help trains nothing")
-    args, _ = runs.parse_args(kind.Args, kind.recipe, flags, kind.ENV_OPTIONS, kind.BUFFERS)
+    args, _ = runs.parse_args(kind, flags)
     if args.eval_only or not args.save_model:
         raise ValueError(f"{'--eval-only' if args.eval_only else '--no-save-model'} leaves no run to publish")
-    return Job(Path(results), [script, *flags], asdict(args))
+    return Job(Path(results), [script, *flags], plain_args(args))
 
 
 def publish(job, numbers):

@@ -34,9 +34,10 @@ from stable_baselines3.common.vec_env import VecEnvWrapper, VecMonitor, VecNorma
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 import evaluate  # noqa: E402
-import runs  # noqa: E402
 from common.command_line import OneLineParser, integer  # noqa: E402
 from common.files import write_json  # noqa: E402
+from common.flags import Range, facts  # noqa: E402
+from common.schedule import Schedule  # noqa: E402
 from common.tasks import env_ids, task_of  # noqa: E402
 from sb3_env import NativeVecEnv  # noqa: E402
 
@@ -48,7 +49,7 @@ class OurFeatures(VecEnvWrapper):
     """Observations as our script's encoder sees them. `raw` are the environments' last observations (N, obs)."""
 
     def __init__(self, venv, script, env_id):
-        constants = {name: torch.tensor(value) for name, value in script.BUFFERS[env_id].items()}
+        constants = {name: torch.tensor(value) for name, value in script.constants(env_id).items()}
         self.script = script
         self.constants = SimpleNamespace(**constants)
         size = self(venv.observation_space.sample()[None]).shape[1]
@@ -85,11 +86,11 @@ class OurCurriculum(BaseCallback):
 
     def _on_rollout_start(self):
         progress = self.num_timesteps / self.samples
-        self.args.log_std = self.model.policy.log_std.mean().item()  # as it was learned
+        self.args.log_std = Schedule(self.model.policy.log_std.mean().item())  # as it was learned
         self.script.set_curriculum(self.batch, self.args, progress)
         if hasattr(type(self.args), "mass_weight"):  # the rocket's script
             price = np.interp(progress, [0.25, 0.6, 1.0], [0.0, 1.0, 0.1])
-            self.batch.mass_weight = float(self.batch.cutoff * self.args.mass_weight * price)
+            self.batch.mass_weight = float(self.batch.cutoff * self.args.mass_weight.at(0.0) * price)
         self.batch.flights_per_start = 1  # the library compares no flights of one start
 
     def _on_step(self):
@@ -200,7 +201,7 @@ def make_model(options, script, args, normalised, steps):
         batch_size=options.batch_size,
         n_epochs=options.epochs,
         gamma=options.gamma,
-        policy_kwargs={"net_arch": [64, 64], "log_std_init": args.log_std, **width},
+        policy_kwargs={"net_arch": [64, 64], "log_std_init": args.log_std.at(0.0), **width},
         seed=options.seed,
         device="cpu",
     )
@@ -253,13 +254,14 @@ def parse_args():
     )
     parser.add_argument("--json", type=Path, help="write the figures there")
     options = parser.parse_args()
+    script = script_of(options.env_id)
+    ranges = facts(script.Args, Range)
     for name, value in vars(options).items():
-        low, high = runs.RANGES.get(name, (None, None))
+        low, high = ranges.get(name, (None, None))
         if low is not None and value is not None and not low <= value <= high:
             parser.error(f"{flag(name)} {value}: must be between {low} and {high}")
     if options.seed == 0:
         parser.error("--seed 0: must be at least 1; the evaluation's starts are those of seed 0")
-    script = script_of(options.env_id)
     for name, without in (("dispersion", None), ("mass_weight", 3.0)):
         if getattr(options, name) != without and not hasattr(script.Args, name):
             parser.error(f"{flag(name)} {getattr(options, name)}: only a rocket has it, not {options.env_id}")
@@ -278,9 +280,9 @@ def main():
     torch.set_num_threads(1)
     script = script_of(options.env_id)
     args = script.Args(**{**script.recipe(script.Args(env_id=options.env_id)), "env_id": options.env_id})
-    args.log_std, args.flights_per_start = script.Args().log_std, 1  # the library learns its noise
+    args = replace(args, log_std=script.Args.log_std, flights_per_start=1)  # the library learns its noise
     given = {name: getattr(options, name) for name in ("dispersion", "mass_weight", "log_std")}
-    vars(args).update({name: value for name, value in given.items() if value is not None and hasattr(args, name)})
+    args = replace(args, **{name: value for name, value in given.items() if value is not None and hasattr(args, name)})
     env_options = {name: getattr(args, name) for name in script.ENV_OPTIONS} | script.FIXED_OPTIONS
 
     batch = gym.make_vec(options.env_id, num_envs=options.num_envs, **env_options).unwrapped

@@ -80,10 +80,6 @@ class Task(Protocol):
         """The line to print if the evaluation's seed is that of the training."""
         ...
 
-    def choices(self) -> dict[str, tuple[str, ...]]:
-        """{name: words} of the task's flags that take one of some words."""
-        ...
-
     def refusal(self, trains: bool, **env_options) -> tuple[str, str] | None:
         """A flag, such as `no_observe_phase`, that does not fit these options, and why. None if all fit."""
         ...
@@ -192,9 +188,6 @@ class SampledTask(GroundTask):
     def interim_flights(self, n: int, **env_options) -> int:
         return n
 
-    def choices(self) -> dict[str, tuple[str, ...]]:
-        return {}
-
     def remark_on_seed(self, eval_seed: int) -> str | None:
         return f"--eval-seed {eval_seed} is the training's --seed: it may have flown these starts"
 
@@ -207,24 +200,6 @@ def add_family(tables: Mapping[str, Any], make_task: Callable[[str], Task]) -> N
     """Make a family's ids known, also those that are added to `tables` later. The same `tables` replace themselves."""
     FAMILIES[:] = [family for family in FAMILIES if family[0] is not tables]
     FAMILIES.append((tables, make_task))
-
-
-class ForEachId(Mapping):
-    """A mapping by environment id that makes a value when it is asked for."""
-
-    def __init__(self, env_ids, make: Callable[[str], Any]):
-        self.env_ids, self.make = tuple(env_ids), make
-
-    def __getitem__(self, env_id: str):
-        if env_id not in self.env_ids:
-            raise KeyError(env_id)
-        return self.make(env_id)
-
-    def __iter__(self):
-        return iter(self.env_ids)
-
-    def __len__(self) -> int:
-        return len(self.env_ids)
 
 
 def env_ids() -> list[str]:

@@ -50,7 +50,7 @@ class Learner:
 
     def __init__(self, envs, **changes):
         self.args, self.envs = make_args(**changes), envs
-        envs.flights_per_start = self.args.flights_per_start
+        envs.flights_per_start = round(self.args.flights_per_start.at(0.0))
         self.agent = make_agent(self.args, envs)
         self.average = AveragedModel(self.agent, multi_avg_fn=get_ema_multi_avg_fn(0.9))
         self.optimizer = RecordingAdam(self.agent)
@@ -129,7 +129,7 @@ def test_radius_curriculum(name, env_id, first):
     """From about K times the radius, geometrically, to the true one; from there on a tenth less, flown in groups."""
     script, envs = importlib.import_module(name), gym.make_vec(env_id, num_envs=1)
     args = script.Args(**script.RECIPES[env_id])
-    refined = float(args.log_radius.split()[-2].split(":")[0])
+    refined = args.log_radius.places[-2]
     for progress, scale in (
         (0.0, first),
         (refined / 2, first**0.5),

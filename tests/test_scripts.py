@@ -30,7 +30,9 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 import baselines
 import envs
 import runs
-from common.errors import NoOptimum
+from common.errors import BadInput, NoOptimum
+from common.flags import Range, facts, plain_args
+from common.schedule import Schedule
 from drawing import animation
 from phased.task import PhasedTask
 
@@ -55,7 +57,7 @@ TINY = [*NETWORK, "--num-envs=2", "--num-minibatches=2", "--update-epochs=2", "-
 
 def parse(*argv, script=DI):
     """A script's checked arguments."""
-    return runs.parse_args(script.Args, script.recipe, list(map(str, argv)), script.ENV_OPTIONS, script.BUFFERS)[0]
+    return runs.parse_args(script, list(map(str, argv)))[0]
 
 
 def files(folder):
@@ -143,12 +145,12 @@ def test_the_papers_recipe_is_table_1(k, script):
     """Every row of its column, first and last value, and nothing of ours in the learning."""
     args = parse("--recipe=paper", script=script)
     for name, row in TABLE_1.items():
-        value, expected = getattr(args, name), row[k]
+        value, expected = plain_args(args)[name], row[k]
         if isinstance(expected, tuple):
             value = script.value_at(value, 0.0), script.value_at(value, 1.0)
         assert value == expected, name
-    assert {name: getattr(args, name) for name in TURNED_OFF} == TURNED_OFF
-    assert not isinstance(args.log_std, str)  # learned
+    assert {name: plain_args(args)[name] for name in TURNED_OFF} == TURNED_OFF
+    assert not args.log_std.has_points  # learned
 
 
 def test_flags_of_the_interface():
@@ -172,13 +174,16 @@ def test_flags_of_the_interface():
 def test_a_recipe_is_what_no_flag_sets(script, env_id):
     """Of every id, and of the two that win over it: a flag and the paper's column."""
     changes = script.recipe(script.Args(env_id=env_id))
+    ours = vars(script.Args(**changes))
     args, paper = parse("--env-id", env_id, script=script), parse("--env-id", env_id, "--recipe=paper", script=script)
     for name, value in vars(script.Args(env_id=env_id)).items():
         assert name in ("recipe", "eval_starts") or getattr(paper, name) == value, name
-        assert name in ("recipe", "eval_starts") or getattr(args, name) == changes.get(name, value), name
+        assert name in ("recipe", "eval_starts") or getattr(args, name) == (ours[name] if name in changes else value), (
+            name
+        )
     assert "eval_starts" not in changes
     typed = parse("--env-id", env_id, "--log-std", "0:-1", "1:-2", "--target-kl=0.5", script=script)
-    assert (typed.log_std, typed.target_kl) == ("0:-1 1:-2", 0.5)
+    assert (str(typed.log_std), typed.target_kl) == ("0:-1 1:-2", 0.5)
     assert typed.total_updates == changes["total_updates"]
 
 
@@ -241,12 +246,12 @@ def test_a_dispersed_training_begins_with_the_shipped_policy(monkeypatch, capsys
     """Named in its recipe; a line where it is missing, or where a flag asks for another network."""
     monkeypatch.chdir(ROOT)
     args = dispersed()
-    assert args.checkpoint == "results/rocket_cutoff/agent.safetensors" and args.log_std == "0:-3.5 1:-6.5"
+    assert args.checkpoint == "results/rocket_cutoff/agent.safetensors" and str(args.log_std) == "0:-3.5 1:-6.5"
     failing = dispersed("--failure=0.25")
     assert failing.checkpoint == "results/rocket_dispersed/agent.safetensors" and failing.total_updates == 150
     anew = dispersed("--embed-dim=8")
     assert anew.checkpoint is None and anew.num_envs == 64
-    assert anew.log_std == ROCKET.RECIPES["RocketAscentCutoff-v0"]["log_std"]  # not that of a trained policy
+    assert str(anew.log_std) == ROCKET.RECIPES["RocketAscentCutoff-v0"]["log_std"]  # not that of a trained policy
     said = capsys.readouterr().out
     assert re.match("--embed-dim 8: .*results/rocket_cutoff.* has another\n.* begins anew", said)
     assert dispersed("--recipe=paper").checkpoint is None
@@ -575,7 +580,7 @@ def test_eval_every_uses_starts_of_its_own(tmp_path, monkeypatch):
     monkeypatch.setattr(PhasedTask, "evaluate", lambda *a, **k: [seeds.append(a[2]), evaluate(*a, **k)][1])
     DI.main([*TINY, "--total-updates=3", "--eval-every=2", "--eval-seed=5"])
     assert len(seeds) == 2 and seeds[1] == 5
-    assert seeds[0] > runs.RANGES["eval_seed"][1]  # no --eval-seed reaches it
+    assert seeds[0] > facts(DI.Args, Range)["eval_seed"].high  # no --eval-seed reaches it
     assert [step for step, _ in scalars(run_folder())["eval/ratio_of_sums"]] == [200, 300]
 
 
@@ -696,7 +701,7 @@ def test_phases_are_one_hot_whatever_their_number(number):
 @pytest.mark.parametrize("env_id, dry", [("RocketAscent-v0", 6644.0), ("TwoStageLEO-v0", 24000.0)])
 def test_mass_is_seen_in_units_of_the_vehicles_dry_mass(env_id, dry):
     """ln 1 = 0 where the last stage is empty; the same mass is another number for the other vehicle."""
-    agent = SimpleNamespace(**{name: torch.tensor(value) for name, value in ROCKET.BUFFERS[env_id].items()})
+    agent = SimpleNamespace(**{name: torch.tensor(value) for name, value in ROCKET.constants(env_id).items()})
     obs = torch.tensor([[6.4e6, 0.0, 0.0, 0.0, 7e3, 0.0, mass, 0.5, 1.0] for mass in (dry, math.e * dry)])
     seen = ROCKET.features(agent, obs)
     (column,) = np.flatnonzero((seen[0] != seen[1]).numpy())
@@ -1131,31 +1136,22 @@ def test_tracking_without_a_login_is_one_line_before_any_solve(refuses, monkeypa
     assert not list(Path("runs").glob("*"))
 
 
-@pytest.mark.parametrize(
-    "scale, line",
-    [
-        ([1.0] * 5, "holds 5; must hold 6 numbers, one for each of its observations"),
-        ([1.0] * 7, "holds 7; must hold 6 numbers"),
-        ([1.0], "holds 1; must hold 6 numbers"),
-        ([1.0] * 5 + [0.0], r"is \[1.0, .*, 0.0\]; must be finite, without 0"),
-        ([1.0] * 5 + [np.nan], r"is \[1.0, .*, nan\]; must be finite, without 0"),
-    ],
-)
-def test_scale_that_does_not_fit_the_observations(scale, line):
-    """A slip in a script's BUFFERS, before anything is learned or written."""
-    env_id = "VanDerPolWaypoints-v0"
-    buffers = {**VDP.BUFFERS, env_id: {"observation_scale": scale}}
-    with pytest.raises(SystemExit) as stop:
-        runs.parse_args(VDP.Args, VDP.recipe, ["--env-id", env_id], VDP.ENV_OPTIONS, buffers)
-    name = r"error: BUFFERS of ppo_gtrxl_vdp.py: observation_scale of VanDerPolWaypoints-v0 "
-    assert re.match(name + line, stop.value.code) and "\n" not in stop.value.code
+@pytest.mark.parametrize("scale", [[1.0] * 5, [1.0] * 7, [1.0] * 5 + [0.0], [1.0] * 5 + [np.nan]])
+def test_scale_that_does_not_fit_the_observations(monkeypatch, scale):
+    """A slip in an environment, before anything is learned or written."""
+    batch = runs.make_batch("VanDerPolWaypoints-v0", 1)
+    batch.observation_scale = np.array(scale)
+    monkeypatch.setattr(runs, "make_batch", lambda env_id, num_envs: batch)
+    line = r"observation_scale of VanDerPolWaypoints-v0 is \[1.0, .*\]; it must hold 6 finite numbers other than 0"
+    with pytest.raises(BadInput, match=line):
+        VDP.constants("VanDerPolWaypoints-v0")
 
 
-def test_id_that_no_environment_has():
+def test_id_that_no_environment_has(monkeypatch):
     """A script's id whose line in PROBLEMS is missing."""
-    buffers = {**DI.BUFFERS, "Forgotten-v0": {"observation_scale": [1.0] * 3}}
-    with pytest.raises(SystemExit, match="error: --env-id Forgotten-v0: .* envs.PROBLEMS must have it"):
-        runs.parse_args(DI.Args, DI.recipe, ["--env-id=Forgotten-v0"], DI.ENV_OPTIONS, buffers)
+    monkeypatch.setattr(DI, "ENV_IDS", (*DI.ENV_IDS, "Forgotten-v0"))
+    with pytest.raises(BadInput, match="env_id is 'Forgotten-v0', of no family"):
+        parse("--env-id=Forgotten-v0")
 
 
 def test_minibatches_left_alone_are_lowered(capsys):
@@ -1168,14 +1164,14 @@ def test_minibatches_left_alone_are_lowered(capsys):
 @pytest.mark.parametrize("num_envs, flights", [(32, 32), (64, 32), (4, 4), (1, 1)])
 def test_flights_per_start_left_alone_are_lowered(capsys, num_envs, flights):
     """The rocket's 32."""
-    assert parse("--num-envs", num_envs, "--num-minibatches=1", script=ROCKET).flights_per_start == flights
+    assert parse("--num-envs", num_envs, "--num-minibatches=1", script=ROCKET).flights_per_start == Schedule(flights)
     line = capsys.readouterr().out
     assert line.startswith(f"--flights-per-start lowered from 32 to {flights}") if flights < 32 else line == ""
 
 
 @pytest.mark.parametrize("num_envs", [48, 33, 6007])
 def test_flights_per_start_left_alone_divide_the_environments(num_envs):
-    assert num_envs % parse("--num-envs", num_envs, script=ROCKET).flights_per_start == 0
+    assert num_envs % parse("--num-envs", num_envs, script=ROCKET).flights_per_start.at(0.0) == 0
 
 
 def test_unwritable_run_folder(refuses):
@@ -1299,7 +1295,7 @@ def test_checkpoint_of_other_buffers_and_sizes(refuses, trained, tmp_path):
     ]:
         path = edited_checkpoint(trained, tmp_path / "agent", tensors)
         message = refuses("--eval-only", "--checkpoint", path)
-        assert re.search(f"--checkpoint {path}: does not fit its own args, BUFFERS or features .{shapes}", message)
+        assert re.search(f"--checkpoint {path}: does not fit its own args, constants or features .{shapes}", message)
 
 
 @pytest.mark.parametrize(
