@@ -20,6 +20,7 @@ import shlex
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -281,8 +282,9 @@ def main():
     script = script_of(options.env_id)
     args = script.Args(**{**script.recipe(script.Args(env_id=options.env_id)), "env_id": options.env_id})
     args = replace(args, log_std=script.Args.log_std, flights_per_start=1)  # the library learns its noise
-    given = {name: getattr(options, name) for name in ("dispersion", "mass_weight", "log_std")}
-    args = replace(args, **{name: value for name, value in given.items() if value is not None and hasattr(args, name)})
+    asked = {name: getattr(options, name) for name in ("dispersion", "mass_weight", "log_std")}
+    given = {name: value for name, value in asked.items() if value is not None and hasattr(args, name)}
+    args = replace(args, **given)
     env_options = {name: getattr(args, name) for name in script.ENV_OPTIONS} | script.FIXED_OPTIONS
 
     batch = gym.make_vec(options.env_id, num_envs=options.num_envs, **env_options).unwrapped

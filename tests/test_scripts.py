@@ -19,6 +19,7 @@ import time
 import types
 from pathlib import Path
 from types import SimpleNamespace
+from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
@@ -1037,7 +1038,8 @@ def flag(name):
 
 
 FIELDS = {field.name: (module, field) for module in reversed(MODULES) for field in dataclasses.fields(module.Args)}
-NUMBERS = [pair for pair in FIELDS.values() if re.search(r"\b(int|float|Schedule)\b", str(pair[1].type))]
+RANGES = {name: bounds for module in MODULES for name, bounds in facts(module.Args, Range).items()}
+NUMBERS = [FIELDS[name] for name in FIELDS if name in RANGES]
 POSITIVE = "total_updates num_envs num_minibatches update_epochs embed_dim num_heads mlp_dim hidden_dim"
 POSITIVE += " eval_starts reward_scale max_grad_norm target_kl flights_per_start"
 
@@ -1047,7 +1049,7 @@ POSITIVE += " eval_starts reward_scale max_grad_norm target_kl flights_per_start
 def test_every_number_has_a_range(refuses, module, field):
     """NaN, infinities and absurd values in every numeric flag, and zero where nothing can be of size zero."""
     values = ["-9", "1" + "0" * 20] + (["0"] if field.name in POSITIVE.split() else [])
-    if re.search("float|Schedule", str(field.type)):
+    if isinstance(RANGES[field.name].low, float) or isinstance(field.default, Schedule):
         values += ["nan", "inf", "-inf"]
     for value in values:
         message = refuses(f"{flag(field.name)}={value}", script=module)
@@ -1059,6 +1061,11 @@ def test_every_number_has_a_range(refuses, module, field):
 
 
 def test_numbers_are_all_there():
+    """Every flag of numbers has a range."""
+    for module in MODULES:
+        hints = get_type_hints(module.Args)
+        numeric = {name for name, hint in hints.items() if {int, float, Schedule} & {hint, *get_args(hint)}}
+        assert numeric == facts(module.Args, Range).keys()
     names = {field.name for _, field in NUMBERS}
     assert names >= {*POSITIVE.split(), "mass_weight", "dispersion"} and len(NUMBERS) >= 30
 
@@ -1098,8 +1105,8 @@ FLOWN = ["--eval-only", "--checkpoint", ROOT / "results" / "di" / "agent.safeten
         (["--num-envs", 80, "--flights-per-start", 3], "--flights-per-start 3: must divide --num-envs 80"),
         (["--num-envs", 4, "--flights-per-start=8"], "--flights-per-start 8: must divide --num-envs 4"),
         (["--num-envs", 8, "--flights-per-start", "0:1", "1:4"], "must divide --num-envs 8; it is 3 in one update"),
-        (["--log-std", "0:-1", "0.4:-2:-7"], "--log-std 0:-1 0.4:-2:-7: must be a number, or points as"),
-        (["--log-std", "0:-1:-2", "0.4:-2:-7"], "--log-std 0:-1:-2 0.4:-2:-7: must be a number, or points as"),
+        (["--log-std", "0:-1", "0.4:-2:-7"], "--log-std: 0:-1 0.4:-2:-7: must be a number, or points as"),
+        (["--log-std", "0:-1:-2", "0.4:-2:-7"], "--log-std: 0:-1:-2 0.4:-2:-7: must be a number, or points as"),
         (["--eval-only"], "--checkpoint"),
         (["--eval-json", "a.json"], "--eval-json a.json: only with --eval-only"),
         (["--eval-npz", "a.npz"], "--eval-npz a.npz: only with --eval-only"),
