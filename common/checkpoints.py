@@ -72,7 +72,7 @@ def read_checkpoint(
 
 def types_of(kind: type | UnionType) -> tuple[type, ...]:
     """The types of which an annotation such as `float | None` consists."""
-    return get_args(kind) if isinstance(kind, UnionType) else (kind,)
+    return get_args(kind) or (kind,)
 
 
 def read_metadata(data: bytes) -> dict[str, str]:

@@ -59,15 +59,15 @@ Fact = TypeVar("Fact")
 def facts(kind: type, wanted: type[Fact]) -> dict[str, Fact]:
     """{field: its Range, Words or Policy} of the fields of an Args that have one. `wanted` is one of the three."""
     hints = get_type_hints(kind, include_extras=True)
-    found = {name: [fact for fact in annotations(hint) if isinstance(fact, wanted)] for name, hint in hints.items()}
+    found = {name: [fact for fact in noted(hint) if isinstance(fact, wanted)] for name, hint in hints.items()}
     return {name: facts[0] for name, facts in found.items() if facts}
 
 
-def annotations(hint: Any) -> list:
+def noted(hint: Any) -> list:
     """All that is annotated to a type or, as in `Share | None`, to a part of it."""
     found = list(getattr(hint, "__metadata__", ()))
     for part in get_args(hint):
-        found += annotations(part)
+        found += noted(part)
     return found
 
 
