@@ -89,7 +89,7 @@ class Workbench:
     def rollout(self):
         args = self.args
         memory_noise = self.script.value_at(args.memory_noise, 0.0)
-        batch, _ = self.script.rollout(self.agent, self.envs, args.reward_scale, memory_noise)
+        batch, _ = self.script.rollout(self.agent, self.envs, {}, args.reward_scale, memory_noise)
         return batch
 
     def epoch(self, batch):

@@ -269,8 +269,8 @@ def test_frames_of_the_batch_are_those_of_single_environments(env_id):
 
 
 def test_after_autoreset_the_next_episode_is_drawn():
-    batch = gym.make_vec("RocketAscent-v0", num_envs=2, render_mode="rgb_array", action_frame="local")
-    batch.unwrapped.end_time = 6.0
+    options = {"render_mode": "rgb_array", "action_frame": "local", "end_time": 6.0}
+    batch = gym.make_vec("RocketAscent-v0", num_envs=2, **options)
     batch.reset()
     begin = batch.render()[0]
     for _ in range(3):
@@ -325,8 +325,8 @@ def test_gymnasiums_own_ways_to_collect_frames(tmp_path):
     frames = env.render()
     assert len(frames) == 3 and all(frame.shape == SHAPE for frame in frames)
     pytest.importorskip("moviepy")
-    env = RecordVideo(gym.make("RocketAscent-v0", render_mode="rgb_array", action_frame="local"), str(tmp_path))
-    env.unwrapped.end_time = 6.0
+    options = {"render_mode": "rgb_array", "action_frame": "local", "end_time": 6.0}
+    env = RecordVideo(gym.make("RocketAscent-v0", **options), str(tmp_path))
     env.reset()
     while not env.step(action_of(env))[2]:
         pass

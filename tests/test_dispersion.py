@@ -301,13 +301,11 @@ def test_events_and_ends_are_each_flights_own():
 
 
 def test_another_end_time_rules_everybody():
-    batch = make(CUTOFF, 4)
-    batch.end_time = 300.5
+    batch = make(CUTOFF, 4, end_time=300.5)
     assert batch.episode_steps == 151 and batch.end_time == 300.5
     final = episode(batch, CUTOFF)[2]
     assert {f["final_time_s"] for f in final.values()} == {300.5}
-    batch.end_time = 961.0
-    assert batch.episode_steps > 481
+    assert make(CUTOFF, 4, end_time=961.0).episode_steps > 481
 
 
 def test_the_observed_mass_is_the_flight_computers():
@@ -420,25 +418,25 @@ def test_seeds():
 def test_flights_of_a_group_share_their_draw(num_envs, group, groups):
     """Flight k has draw k // G, every second one the mirror of the one before; given draws stay each flight's own."""
     batch, half, few = make(CUTOFF, num_envs), make(CUTOFF, -(-groups // 2)), make(CUTOFF, groups)
-    batch.flights_per_start = group
+    training = {"training": {"flights_per_start": group}}
     rows = np.arange(num_envs) // group
     for seed in (1, None):  # the second draws anew
-        batch.reset(seed=seed)
+        batch.reset(seed=seed, options=training)
         half.reset(seed=seed)  # a smaller batch without groups, whose draws have no mirror
         few.reset(options={"draw": np.concatenate([[z, -z] for z in half.draw])[:groups]})
         np.testing.assert_array_equal(batch.draw, few.draw[rows])
         np.testing.assert_array_equal(batch.vehicles.mass, few.vehicles.mass[rows])
         assert len(np.unique(batch.draw[:, 0])) == groups
     given = np.linspace(-1, 1, batch.draw.size).reshape(batch.draw.shape)
-    batch.reset(options={"draw": given})
+    batch.reset(options={"draw": given, **training})
     np.testing.assert_array_equal(batch.draw, given)
 
 
 def test_a_reset_groups_what_an_autoreset_has_scattered():
     """After a crash of one flight its environment has a draw of its own; from the next reset on k has draw k // G."""
     batch, action = make(CUTOFF, 4), np.tile([1.0, 0.1, 0.0], (4, 1))
-    batch.flights_per_start = 2
-    batch.reset(seed=1)
+    training = {"training": {"flights_per_start": 2}}
+    batch.reset(seed=1, options=training)
     first = batch.draw.copy()
     action[1] = -1.0, 0.0, 0.0  # into the ground
     ended = np.zeros(4, dtype=bool)
@@ -447,7 +445,7 @@ def test_a_reset_groups_what_an_autoreset_has_scattered():
     assert ended.tolist() == [False, True, False, False]
     np.testing.assert_array_equal(batch.draw[[0, 2, 3]], first[[0, 2, 3]])
     assert len(np.unique(batch.draw[:, 0])) == 3
-    batch.reset()
+    batch.reset(options=training)
     np.testing.assert_array_equal(batch.draw[::2], batch.draw[1::2])
     assert len(np.unique(np.append(batch.draw[:, 0], first[:, 0]))) == 4
 
@@ -680,8 +678,7 @@ def test_a_crash_is_charged_the_flights_own_propellant():
     z = np.zeros((2, 16))
     z[1, DRAW.index("propellant_3")] = 2.0
     batch = make(CUTOFF, 2)
-    batch.mass_weight = 1.0
-    batch.reset(options={"draw": z})
+    batch.reset(options={"draw": z, "training": {"mass_weight": 1.0}})
     final = batch.step(np.tile([-1.0, 0.0, 0.0], (2, 1)))[4]["final_info"]
     assert final["crashed"].all()
     difference = final["R_penalties"][1] - final["R_penalties"][0]
