@@ -22,7 +22,6 @@ from drawing import animation
 from drawing.training import median_curve
 from phased.metrics import cost_parts, hits_every_circle, near_origin_metrics, ratio_metrics
 
-ROOT = Path(__file__).parent.parent
 IN_THE_PLANE = [env_id for env_id, problem in envs.PROBLEMS.items() if problem.weighted and problem.states == 2]
 SINGLE, WAYPOINTS = "DoubleIntegrator-v0", "DoubleIntegratorWaypoints-v0"
 IN_THE_PLANE = [env_id for env_id, problem in envs.PROBLEMS.items() if problem.weighted and problem.states == 2]
@@ -216,17 +215,6 @@ def test_no_loss_near_the_origin_where_the_target_is_elsewhere(new_problem):
     assert "origin" not in table_of(metrics)
 
 
-def test_loss_near_the_origin_is_that_of_the_flights():
-    n = 60
-    reference = reference_flight(SINGLE, 5, n)
-    metrics, arrays = evaluate.evaluate(SINGLE, feedback(SINGLE, 0.0, effort=60.0), 5, n, reference)
-    losses = []
-    for x, ours, best in zip(arrays["x"], arrays["cost"], reference["cost"]):
-        if (x[0, 0] ** 2 + x[0, 1] ** 2) ** 0.5 <= 0.2:
-            losses.append(ours - best)
-    assert 0 < len(losses) < n and metrics["loss_near_origin_mean"] == pytest.approx(sum(losses) / len(losses))
-
-
 def test_waypoint_ratios_are_over_the_starts_that_hit_every_circle():
     n = 24
     good = feedback(WAYPOINTS, 1e3, effort=1.3)
@@ -363,16 +351,6 @@ def test_table_shows_optimum_ours_and_ratio():
     assert line.endswith(f"of the origin {metrics['loss_near_origin_mean']:.4f}")
 
 
-def test_table_of_an_older_evaluation_and_of_waypoints():
-    metrics, _ = evaluate.evaluate(SINGLE, feedback(SINGLE, 20.0, 2.0), 5, 20, reference_flight(SINGLE, 5, 20))
-    older = {key: value for key, value in metrics.items() if key not in NEAR | {"ten_start_ratio_mean_p05"}}
-    text = table_of(older)
-    assert "samples of ten" not in text and "of the origin" not in text and f"mean {metrics['ratio_mean']:.4f}" in text
-    metrics, _ = evaluate.evaluate(WAYPOINTS, feedback(WAYPOINTS, 1e3), 5, 20, reference_flight(WAYPOINTS, 5, 20))
-    text = table_of(metrics)
-    assert "near the origin" not in text and "samples of ten" in text
-
-
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), np.float64("nan")])
 def test_json_refuses_what_is_not_finite_and_keeps_the_old_file(bad, tmp_path):
     path = tmp_path / "eval.json"
@@ -455,45 +433,6 @@ def test_figures_show_policy_optimum_targets_and_bounds():
     assert {line.get_ydata()[0] for line in control.lines if line.get_linestyle() == "--"} == {-3.0, 3.0}
     assert all(ax.get_xlabel() and ax.get_ylabel() for ax in figure.axes)
     assert f"{metrics['ratio_of_sums']:.4f}" in figure.get_suptitle() and WAYPOINTS in figure.get_suptitle()
-
-
-def test_cost_figure_shows_the_parts_and_marks_misses():
-    policy = lets_go(feedback(WAYPOINTS, 1e3, effort=1.3), np.arange(12) == 2, 90)
-    reference = reference_flight(WAYPOINTS, 3, 12)
-    metrics, arrays = evaluate.evaluate(WAYPOINTS, policy, 3, 12, reference)
-    figure = figure_of("costs.png", arrays, metrics)
-    panels = {ax.get_ylabel(): ax for ax in figure.axes}
-    flown = envs.fly(WAYPOINTS, policy, baselines.starts(3, 12))
-    for name in ("state", "control", "terminal"):
-        heights = [bar.get_height() for bar in panels[f"{name} cost"].patches]
-        assert heights == pytest.approx([*flown[f"cost_{name}"][:10], *reference[f"cost_{name}"][:10]])
-    labels = [text.get_text() for text in panels["total cost J"].texts]
-    expected = [f"{a / b:.3f}" for a, b in zip(arrays["cost"][:10], arrays["cost_reference"][:10])]
-    assert labels == [*expected[:2], "miss", *expected[3:]]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("env_id", [SINGLE, "VanDerPol-v0"])
-def test_cost_error_figure_shows_every_start(env_id, tmp_path):
-    metrics, arrays = evaluate.evaluate(env_id, feedback(env_id, 20.0, 2.0), 5, 20, reference_flight(env_id, 5, 20))
-    arrays["cost"][3] = arrays["cost_reference"][3] - 1e-3  # no loss: drawn as the smallest
-    loss = [max(ours - best, 1e-6) for ours, best in zip(arrays["cost"], arrays["cost_reference"])]
-    distance = [(x[0, 0] ** 2 + x[0, 1] ** 2) ** 0.5 for x in arrays["x"]]
-    figure = figure_of("cost_error.png", arrays, metrics)
-    box, over_distance, _ = figure.axes
-    dots = box.collections[0]
-    shown = sorted([*point, value] for point, value in zip(dots.get_offsets().tolist(), dots.get_array().tolist()))
-    expected = sorted([*x[0], value] for x, value in zip(arrays["x"].tolist(), loss))
-    assert np.array(shown) == pytest.approx(np.array(expected))
-    assert dots.norm(dots.get_array()).max() > dots.norm(dots.get_array()).min()
-    assert box.patches[0].radius == 0.2 and box.get_xlim()[1] > 1
-    lines = {line.get_label(): line.get_xydata() for line in over_distance.lines}
-    assert lines["optimum $J^*$"] == pytest.approx(np.c_[distance, arrays["cost_reference"]])
-    assert lines["loss of the policy $J - J^*$"] == pytest.approx(np.c_[distance, loss])
-    assert over_distance.get_xscale() == over_distance.get_yscale() == "log"
-    assert all(ax.get_xlabel() and ax.get_ylabel() for ax in (box, over_distance))
-    arrays["cost"] = arrays["cost_reference"]  # the optimum itself can be drawn, too
-    assert tmp_path / "figures" / "cost_error.png" in evaluate.draw_figures(tmp_path, arrays, metrics, [])
 
 
 def test_median_curve_ends_with_the_shortest_seed():
@@ -714,22 +653,3 @@ def test_refused_publishing_leaves_the_folder_untouched(tmp_path, monkeypatch, c
     with pytest.raises(SystemExit, match="eval.json"):
         command_line(monkeypatch, capsys, "publish", tmp_path / "eval.json", tmp_path / "new")
     assert not (tmp_path / "new").exists()
-
-
-def test_training_figure_of_a_small_problem_shows_what_the_mean_action_loses():
-    """In log scale, each seed and their median; the returns are cut where a few early updates would hide the rest."""
-    steps, update = 4000 * np.arange(1, 41), np.arange(1, 41)
-    curves = [
-        {
-            "charts/episodic_return": (steps, np.where(update < 2, -1e4, 10.0 - 10 / update)),
-            "eval/ratio_of_sums": (steps[9::10], 1 + 10.0 ** -np.arange(1, 5) * factor),
-        }
-        for factor in (1, 2, 4)
-    ]
-    metrics, arrays = evaluate.evaluate(SINGLE, feedback(SINGLE, 1e3), 0, 5)
-    figure = figure_of("training.png", arrays, metrics, curves)
-    returns, *_, loss = figure.axes
-    assert len(figure.axes) == 4 and loss.get_yscale() == "log" and "less 1" in loss.get_ylabel()
-    drawn = [line.get_ydata() for line in loss.lines]
-    np.testing.assert_allclose(drawn, np.outer([1, 2, 4, 2], 10.0 ** -np.arange(1, 5)), rtol=1e-9)
-    assert 4 < returns.get_ylim()[0] < 5 and "-1e+04" in returns.get_title()

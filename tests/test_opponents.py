@@ -49,7 +49,7 @@ def linear():
     return flight, axes, *guidance.linearise_flight(ROCKETS[CUTOFF], flight, axes)
 
 
-@pytest.mark.parametrize("k", [3, 37, 75, 130, 300, 461])  # 37 to 130: steps with a staging; 462 is the last
+@pytest.mark.parametrize("k", [3, 37, 130, 461])  # 37 and 130: steps with a staging; 462 is the last
 def test_linearised_steps_are_scipys(linear, k):
     """Central differences of SciPy's integration between the stagings, with other differences and other axes."""
     flight, axes, A, B = linear
@@ -121,7 +121,7 @@ def test_by_energy_a_late_flight_is_no_other_flight():
     assert (np.linalg.norm(by_time - flight["u"][places], axis=1) > 0.01).all()
 
 
-@pytest.mark.parametrize("env_id", [CUTOFF, LEO])
+@pytest.mark.parametrize("env_id", [LEO])
 @pytest.mark.parametrize("by_energy", [False, True])
 def test_a_late_flight_is_steered_as_gently_as_the_one_before(env_id, by_energy):
     """The optimum's last step is a fraction of the others, and the angle that mends an error within it is large."""
@@ -232,15 +232,7 @@ def test_of_the_nominal_vehicle_the_measured_plan_is_the_nominal_one(monkeypatch
     assert len(laws[0].seconds) == len(laws[1].seconds) == 7
 
 
-def test_what_is_measured_takes_most_of_the_miss(monkeypatch):
-    monkeypatch.setattr(guidance, "REPLAN_EVERY", 40.0)
-    z, exhaust = draws(ROCKET, 1.0, 5, 5), guidance.nominal_exhaust(ROCKET)
-    nominal = ends(guidance.Replanning(CUTOFF), z)["error_norm"]
-    measured = ends(guidance.Replanning(CUTOFF, exhaust=exhaust), z)["error_norm"]
-    assert np.median(measured) < np.median(nominal) / 10 and measured.max() < 1e-5
-
-
-@pytest.mark.parametrize("step", [131, 249, 455])
+@pytest.mark.parametrize("step", [131, 455])
 def test_a_loss_of_thrust_is_measured(step):
     """A fifth, from before the last burn on, within the step before a plan, after the last plan that is due.
 
@@ -431,13 +423,9 @@ def test_report(compared):
     [
         (["{missing}"], "No such file"),
         (["{fixed}"], "the env_id of .* is RocketAscent-v0; it must be a rocket's with cut-off"),
-        (["{di}"], "the env_id of .* is DoubleIntegrator-v0; it must be a rocket's with cut-off"),
         (["{good}", "--starts=9"], "'9' must be a whole number from 10 to 100000"),
         (["{good}", "--starts=20", "--solved=21"], "--solved is 21; it must be at most 20, as --starts is"),
-        (["{good}", "--solved=1706"], "--solved is 1706; it must be at most 1705"),
-        (["{good}", "--dispersion=0"], "'0' must be a number above 0, at most 10"),
         (["{good}", "--dispersion=nan"], "'nan' must be a number above 0, at most 10"),
-        (["{good}", "--eval-seed=-1"], "'-1' must be a whole number"),
         (["{good}", "--also", "mine"], "'mine' must be NAME=PATH"),
         (
             ["{good}", "--also", "replan={good}/agent.safetensors"],

@@ -104,15 +104,6 @@ def test_mass_history_to_the_gram():
     assert m[960.0] == pytest.approx(6668.02857, abs=1e-4) and m[961.0] == pytest.approx(6644, abs=1e-6)
 
 
-def test_mass_history_of_two_stages():
-    """Its staging is at a step's end: what is dropped is gone there."""
-    m, flow = masses(TWO_STAGE), 107500 / 393
-    assert m[0.0] == 564500 and m[160.0] == pytest.approx(564500 - 160 * 411000 / 162, abs=1e-6)
-    assert m[162.0] == pytest.approx(564500 - 433000, abs=1e-6)
-    assert m[164.0] == pytest.approx(131500 - 2 * flow, abs=1e-6)
-    assert m[554.0] == pytest.approx(24000 + flow, abs=1e-6) and m[555.0] == pytest.approx(24000, abs=1e-6)
-
-
 def test_table_isp_runs_dry_and_keeps_the_residual():
     m = masses(PAPER, True)
     flow = (m[950.0] - m[952.0]) / 2
@@ -157,24 +148,6 @@ def test_coast_conserves_energy_and_angular_momentum(v):
         s = rk4(lambda x, u: ascent_dynamics(x, u, rocket), s, (1.0, 0.0, 0.0, 0.0, 0.0), dt)
         assert energy(s) == pytest.approx(v.goal_energy, rel=1e-9)
     np.testing.assert_allclose(s[:3], v.on_goal_orbit(0.0)[:3], atol=1.0)
-
-
-@both
-def test_in_plane_steering_keeps_the_plane(v):
-    envs = make(v.fixed, 2, rocket=dry_vehicle(v, omega_e=0.0), action_frame="local")
-    envs.reset()
-    # a low circle is flown three times as high, or the thrust would drive it into the ground
-    scale = np.array([1.0] * 6 if v.e else [3.0] * 3 + [3**-0.5] * 3)
-    envs.unwrapped.y[:6] = np.array([scale * v.on_goal_orbit(1.0), scale * v.on_goal_orbit(2.0)]).T
-    before = np.linalg.norm(np.cross(envs.unwrapped.y[:3].T, envs.unwrapped.y[3:6].T), axis=1)
-    for pitch in np.linspace(-1.5, 2.0, v.steps - 1):
-        up, along = math.sin(pitch), math.cos(pitch)
-        obs, _, terminated, *_ = envs.step([[up, along, 0.0], [-up, 2 * along, 0.0]])
-        assert not terminated.any()
-        h = np.cross(obs[:, :3], obs[:, 3:6])
-        direction = h / np.linalg.norm(h, axis=1, keepdims=True)
-        np.testing.assert_allclose(direction, [v.plane[:, 2]] * 2, rtol=0, atol=1e-12)
-    assert (np.abs(np.linalg.norm(h, axis=1) / before - 1) > 0.1).all(), "the thrust should have acted"
 
 
 @both
@@ -441,12 +414,8 @@ def test_single_environment_is_the_vector_environment(v):
     "env_id, steering, last",
     [
         (FIXED, "ascent", 481),
-        (CUTOFF, "over the top", 481),
         (CUTOFF, "ascent", None),
-        (FIXED, "late dive", None),
         (CUTOFF, "early crash", None),
-        (LEO_FIXED, "ascent", 278),
-        (LEO, "ascent", None),
     ],
 )
 def test_steps_outside_an_episode_are_refused(env_id, steering, last):
@@ -491,15 +460,6 @@ def advance_from(env_id, states, t, actions):
 
 
 @both
-def test_plunging_row_of_a_batch_is_a_batch_of_one(v):
-    up, along, _ = v.up_along_cross(v.start)
-    states = [[*(RE + h) * up, *v * (0.9 * along - 0.43 * up), 15000.0] for h, v in ((12e3, 7800), (3e3, 9000))]
-    both = advance_from(v.fixed, states, 200, [up, up])[0]
-    for n in range(2):
-        np.testing.assert_array_equal(advance_from(v.fixed, states[n : n + 1], 200, [up])[0][0], both[n])
-
-
-@both
 def test_cut_off_row_of_a_batch_is_a_batch_of_one(v):
     u, y, (time, _) = v.reference(False)
     last, rng = int(time // 2), np.random.default_rng(8)
@@ -518,8 +478,8 @@ def test_cut_off_row_of_a_batch_is_a_batch_of_one(v):
 # --- end time ---------------------------------------------------------------------------------------------------------
 
 
-FLIGHTS = [(924.139, 463), (2.0, 1), (1.0, 1), (76.0, 38), (75.2, 38), (262.0, 131), (3, 2), (961.0, 481)]
-FLIGHTS_OF_TWO_STAGES = [(541.3, 271), (1.0, 1), (162.0, 81), (163.0, 82), (555.0, 278)]
+FLIGHTS = [(924.139, 463), (1.0, 1), (75.2, 38)]
+FLIGHTS_OF_TWO_STAGES = [(163.0, 82)]
 
 
 @pytest.mark.parametrize(
@@ -549,7 +509,7 @@ def test_end_time(v, end_time, steps, alone):
 
 
 @both
-@pytest.mark.parametrize("value", [0, -1, math.nan, 962, 555.1, math.inf, -math.inf])
+@pytest.mark.parametrize("value", [0, math.nan, 962, 555.1])
 def test_bad_end_times_are_refused(v, value):
     if value == 555.1 and v is PAPER:
         pytest.skip("within its 961 s")
@@ -557,17 +517,6 @@ def test_bad_end_times_are_refused(v, value):
         with pytest.raises(ValueError, match=rf"end_time is {value} "):
             env.unwrapped.end_time = value
         assert env.unwrapped.end_time == v.end
-
-
-@both
-@pytest.mark.parametrize("value", [1e-10, 2e-9])
-def test_tiny_end_time_is_one_step_or_refused(v, value):
-    envs = make(v.fixed)
-    try:
-        envs.unwrapped.end_time = value
-    except ValueError as error:
-        assert "end_time is" in str(error)
-    assert envs.unwrapped.episode_steps == (1 if envs.unwrapped.end_time == value else v.steps)
 
 
 @pytest.mark.parametrize("v, end_time", [(PAPER, 100.0), (PAPER, 200.0), (TWO_STAGE, 160.0)])
@@ -579,16 +528,6 @@ def test_short_flights_know_no_last_phase(v, end_time, monkeypatch):
     *_, final = fly(envs, lambda obs, t: v.programme(2 * t))
     assert final["final_time_s"] == end_time
     assert final["R_penalties"] > -1
-
-
-@both
-def test_end_time_changes_between_episodes(v):
-    envs = make(v.fixed, action_frame="local")
-    for end_time, steps in ((100.0, 50), (424.139, 213), (v.end, v.steps)):
-        envs.unwrapped.end_time = end_time
-        seen, rewards, final = fly(envs, lambda obs, t: v.programme(2 * t))
-        assert (len(rewards), final["final_time_s"]) == (steps, end_time)
-        assert final["episodic_return"] == pytest.approx(rewards.sum(), abs=1e-10)
 
 
 # --- bad and odd input ------------------------------------------------------------------------------------------------
@@ -653,11 +592,8 @@ def test_other_bad_input_is_refused():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("env_id", REGISTERED)
-@pytest.mark.parametrize("action_frame", ["eci", "local"])
-@pytest.mark.parametrize("table_isp", [False, True])
-@pytest.mark.parametrize("observe_phase", [True, False])
-def test_check_env(env_id, action_frame, table_isp, observe_phase):
-    env = gym.make(env_id, action_frame=action_frame, table_isp=table_isp, observe_phase=observe_phase)
+def test_check_env(env_id):
+    env = gym.make(env_id)
     assert env.spec.max_episode_steps is None
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")

@@ -10,7 +10,6 @@ import spiceypy
 from rocket_oracle import MU, PAPER, RE, both, rotation
 
 from envs import ROCKET, ROCKETS, launch_raan, orbital_elements, target_axes, target_orbit, terminal_error
-from rocket.vehicle import OrbitalElements
 
 # --- orbital elements -------------------------------------------------------------------------------------------------
 
@@ -123,22 +122,6 @@ def test_target_orbit_is_the_benchmarks():
         of_state = np.cross(state[3:], np.cross(state[:3], state[3:])) / MU - state[:3] / np.linalg.norm(state[:3])
         np.testing.assert_allclose(of_state, e, rtol=0, atol=1e-12)
     np.testing.assert_allclose(target_axes(), v.plane.T, rtol=0, atol=1e-15)
-
-
-def test_target_orbit_and_orbital_elements_are_inverse():
-    rng = np.random.default_rng(3)
-    elements = OrbitalElements(
-        rng.uniform(7e6, 4e7, 200), rng.uniform(0.01, 0.9, 200), rng.uniform(0.05, 3, 200),
-        rng.uniform(0, 6.28, 200), rng.uniform(0, 6.28, 200),
-    )  # fmt: skip
-    h, e = target_orbit(elements)
-    states = np.array([spice_state(*row, anomaly) for *row, anomaly in zip(*elements, rng.uniform(0, 6, 200))])
-    np.testing.assert_allclose(h, np.cross(states[:, :3], states[:, 3:]), rtol=0, atol=1e-11 * np.abs(h).max())
-    back = orbital_elements(states)
-    again = target_orbit(back)
-    np.testing.assert_allclose(np.array(back), np.array(elements), rtol=1e-8)
-    np.testing.assert_allclose(again[0], h, rtol=0, atol=1e-11 * np.abs(h).max())
-    np.testing.assert_allclose(again[1], e, rtol=0, atol=1e-11)
 
 
 @both
