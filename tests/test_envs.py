@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
-from gymnasium.vector import AutoresetMode
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
@@ -150,18 +149,6 @@ def test_rewards_are_the_papers(env_id):
         assert flight["hit"][n].tolist() == hits
         np.testing.assert_allclose(flight["terminal_error"][n], distances, rtol=1e-12)
     assert flight["hit"].any(axis=0).all() and not flight["hit"].all(axis=0).any(), "both outcomes should occur"
-
-
-@pytest.mark.parametrize("env_id", PLANE)
-def test_fly_records_states_and_applied_controls(env_id):
-    u_max, x0 = TABLES[env_id][0], CORNERS
-    actions = random_actions(env_id, 4)
-    flight = fly(env_id, lambda obs, t: actions[t], x0)
-    np.testing.assert_array_equal(flight["x"][:, 0], x0)
-    np.testing.assert_array_equal(flight["u"], np.clip(actions[:, :, 0], -u_max, u_max).T)
-    again = fly(env_id, lambda obs, t: flight["u"][:, t, None], x0)
-    np.testing.assert_array_equal(again["x"], flight["x"])
-    assert flight["x"].shape == (4, horizon(env_id) + 1, 2)
 
 
 def returns_with(env_id, name, values):
@@ -327,17 +314,6 @@ def test_waypoints_at_rest_have_a_box_with_a_width(new_problem):
     env_id = new_problem(replace(PROBLEMS["VanDerPolWaypoints-v0"], env_id="AtRest-v0", phases=phases))
     space = gym.make_vec(env_id, num_envs=1).single_observation_space
     assert (space.low[:4] < space.high[:4]).all() and space.high[2] == 0.5
-
-
-@pytest.mark.parametrize("env_id", PLANE)
-def test_vector_environment_is_native(env_id):
-    envs = gym.make_vec(env_id, num_envs=5)
-    u_max = TABLES[env_id][0]
-    assert isinstance(envs.unwrapped, PhasedVectorEnv)
-    assert envs.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
-    assert (envs.single_action_space.low, envs.single_action_space.high) == (-u_max, u_max)
-    obs, _ = envs.reset(seed=0)
-    assert envs.observation_space.contains(obs) and obs.dtype == np.float64
 
 
 @pytest.mark.parametrize("env_id", PLANE)

@@ -19,7 +19,6 @@ from common import files
 from common.curves import cell, evaluated, read_csv, read_curve, write_csv
 from common.files import write_json, write_npz
 from drawing import animation
-from drawing.training import median_curve
 from phased.metrics import cost_parts, hits_every_circle, near_origin_metrics, ratio_metrics
 
 IN_THE_PLANE = [env_id for env_id, problem in envs.PROBLEMS.items() if problem.weighted and problem.states == 2]
@@ -33,7 +32,6 @@ TEN_STARTS = {"ten_start_ratio_mean_p05", "ten_start_ratio_mean_p50", "ten_start
 NEAR = {"loss_near_origin_mean"}  # of single phases, where a start is near the origin
 COSTS = {f"{side}cost{part}_mean" for side in ("", "reference_") for part in ("", "_state", "_control", "_terminal")}
 HITS = {"hit_rate", "reference_hit_rate", "terminal_error_max", "hit_rate_phase_1"}
-ARRAYS = {"t", "x", "u", "reward", "cost", "x_reference", "u_reference", "cost_reference"}
 
 # the problems that `feedback` was written for, and the effort with which it hits their circles: low gains where only
 # these make the linear law good enough
@@ -205,16 +203,6 @@ def test_loss_near_the_origin_by_hand():
     assert near_origin_metrics(envs.PROBLEMS[SINGLE], x0[2:4], cost[2:4], optimum[2:4]) == {}
 
 
-def test_no_loss_near_the_origin_where_the_target_is_elsewhere(new_problem):
-    """There J* does not vanish, and no line says so."""
-    phase = replace(envs.PROBLEMS[SINGLE].phases[0], target=(0.5, 0.0))
-    env_id = new_problem(replace(envs.PROBLEMS[SINGLE], env_id="Elsewhere-v0", phases=(phase,)))
-    reference = reference_flight(env_id, 5, 20)
-    metrics, _ = evaluate.evaluate(env_id, feedback(env_id, 0.0, effort=60.0), 5, 20, reference)
-    assert metrics.keys() & (RATIOS | NEAR) == RATIOS
-    assert "origin" not in table_of(metrics)
-
-
 def test_waypoint_ratios_are_over_the_starts_that_hit_every_circle():
     n = 24
     good = feedback(WAYPOINTS, 1e3, effort=1.3)
@@ -264,26 +252,6 @@ def test_keys_are_exactly_the_interfaces(env_id):
     phases = len(envs.PROBLEMS[env_id].phases)
     extra = {f"hit_rate_phase_{k}" for k in range(2, phases + 1)} if phases > 1 else NEAR
     assert metrics.keys() == COMMON | RATIOS | TEN_STARTS | COSTS | HITS | extra
-
-
-@pytest.mark.parametrize("env_id", IN_THE_PLANE)
-def test_metrics_and_arrays_are_plain(env_id, tmp_path):
-    """Of every problem: two flights that steer a little and not at all, wherever these lead."""
-    x0 = baselines.starts(5, 20, envs.PROBLEMS[env_id].x0_max)
-    drift = envs.fly(env_id, lambda obs, t: np.zeros((len(obs), 1)), x0)
-    metrics, arrays = evaluate.evaluate(env_id, lambda obs, t: -0.1 * obs[:, 1:2], 5, 20, drift)
-    every_phase = {f"hit_rate_phase_{k}" for k in range(1, len(envs.PROBLEMS[env_id].phases) + 1)}
-    allowed = COMMON | COSTS | HITS | every_phase
-    assert allowed <= metrics.keys() <= allowed | RATIOS | TEN_STARTS | NEAR
-    assert {type(value) for value in metrics.values()} <= {str, int, float}
-    assert all(np.isfinite(value) for value in metrics.values() if isinstance(value, float))
-    write_json(tmp_path / "eval.json", metrics)
-    assert json.loads((tmp_path / "eval.json").read_text()) == metrics
-    assert arrays.keys() == ARRAYS
-    write_npz(tmp_path / "eval.npz", arrays)
-    with np.load(tmp_path / "eval.npz") as file:
-        assert set(file.files) == ARRAYS
-        assert all(np.array_equal(file[key], arrays[key]) for key in ARRAYS)
 
 
 def test_arrays_hold_the_flight_and_not_the_next_episode():
@@ -435,14 +403,6 @@ def test_figures_show_policy_optimum_targets_and_bounds():
     assert f"{metrics['ratio_of_sums']:.4f}" in figure.get_suptitle() and WAYPOINTS in figure.get_suptitle()
 
 
-def test_median_curve_ends_with_the_shortest_seed():
-    long = np.array([0, 10, 20, 30]), np.array([0.0, 1.0, 2.0, 3.0])
-    short = np.array([5, 15, 25]), np.array([2.0, 4.0, 6.0])
-    grid, median = median_curve([long, short])
-    assert grid.tolist() == [10, 20]
-    assert median.tolist() == [(1 + 3) / 2, (2 + 5) / 2]
-
-
 # ---------------------------------------------------------------------------------------------------------------------
 # Results folders
 # ---------------------------------------------------------------------------------------------------------------------
@@ -514,13 +474,6 @@ def test_seeds_alone_say_of_which_problem_a_folder_is(tmp_path):
     assert [path.name for path in other.parent.iterdir()] == ["2.json"]
 
 
-@pytest.mark.parametrize("text", ["", "global_step,a\n", "global_step,a\nx,1\n", "global_step,a\n1\n"])
-def test_a_curve_that_is_none_is_named(tmp_path, text):
-    (tmp_path / "1.csv").write_text(text)
-    with pytest.raises(ValueError, match="1.csv is not a training curve"):
-        read_csv(tmp_path / "1.csv")
-
-
 @pytest.mark.slow
 def test_shipping_another_seed_replaces_all_or_nothing(tmp_path, monkeypatch, capsys):
     first, second = make_run(tmp_path / "a", seed=1), make_run(tmp_path / "b", seed=2)
@@ -568,14 +521,6 @@ def test_a_seed_is_listed_once_the_rest_is_there(tmp_path, monkeypatch, capsys):
     command_line(monkeypatch, capsys, "publish", run, results)
     assert written[-1] == results / "seeds" / "1.json"
     assert {path.name for path in written if results in path.parents} == {"1.csv", "1.json", *SHIPPED}
-
-
-@pytest.mark.slow
-def test_figures_of_a_run_folder(tmp_path, monkeypatch, capsys):
-    run = make_run(tmp_path / "run", env_id=WAYPOINTS)
-    printed = command_line(monkeypatch, capsys, "figures", run)
-    assert "circle 2" in printed and str(run / "figures" / "costs.png") in printed
-    assert {path.name for path in (run / "figures").iterdir()} == {"training.png", "trajectories.png", "costs.png"}
 
 
 SHIPPED = ("agent.safetensors", "eval.npz", "eval.json")

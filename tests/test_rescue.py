@@ -506,23 +506,6 @@ def test_opponents_meet_the_same_failures(compared, capsys):
     assert (folder / "figures" / "opponents_at_ignition_by_loss.png").stat().st_size > 10_000
 
 
-@pytest.mark.slow
-def test_opponents_keep_what_rows_by_size_need(compared):
-    folder, flown = compared
-    with np.load(folder / "opponents_at_ignition.npz") as file:
-        arrays = {key: file[key] for key in file.files}
-    assert arrays["failure"].shape == (10, 3)
-    has_failed = arrays["failure"][:, 0] >= 0
-    assert (arrays["failure"][has_failed, 0] == 3).all()
-    np.testing.assert_array_equal(np.isfinite(arrays["best_mass_kg"]), has_failed | (np.arange(10) < 5))
-    np.testing.assert_allclose(arrays["best_mass_kg"][:5], [optimum["final_mass"] for optimum in flown.optima], 1e-5)
-    for name, ends in flown.arrays.items():
-        errors = np.linalg.norm(ends["final_error"], axis=1)
-        np.testing.assert_allclose(arrays[f"{name}_error_norm"], errors, rtol=1e-6)
-        np.testing.assert_allclose(arrays[f"{name}_final_mass_kg"], ends["final_y"][:, 6], rtol=1e-6)
-        assert len(arrays[f"{name}_mass_reached_kg"]) == len(errors)
-
-
 @pytest.mark.parametrize(
     "argv, line",
     [

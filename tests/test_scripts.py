@@ -631,16 +631,6 @@ def test_phases_are_one_hot_whatever_their_number(number):
         assert len(columns) == number and torch.equal(seen[:, columns], torch.eye(number))
 
 
-@pytest.mark.parametrize("env_id, dry", [("RocketAscent-v0", 6644.0), ("TwoStageLEO-v0", 24000.0)])
-def test_mass_is_seen_in_units_of_the_vehicles_dry_mass(env_id, dry):
-    """ln 1 = 0 where the last stage is empty; the same mass is another number for the other vehicle."""
-    agent = SimpleNamespace(**{name: torch.tensor(value) for name, value in ROCKET.BUFFERS[env_id].items()})
-    obs = torch.tensor([[6.4e6, 0.0, 0.0, 0.0, 7e3, 0.0, mass, 0.5, 1.0] for mass in (dry, math.e * dry)])
-    seen = ROCKET.features(agent, obs)
-    (column,) = np.flatnonzero((seen[0] != seen[1]).numpy())
-    assert seen[:, column].tolist() == pytest.approx([0.0, 1.0], abs=1e-6)
-
-
 @pytest.mark.slow
 def test_checkpoint_of_the_other_variant(rocket, tmp_path, capsys):
     """Allowed to begin from, with a line that says so; `--resume` takes no other id at all."""
@@ -1000,14 +990,6 @@ def test_what_is_no_number_and_no_flag(refuses, argv):
     assert argv[0] in refuses(*argv)
 
 
-@pytest.mark.parametrize(
-    "script, env_id", [(DI, "Nonsense-v0"), (DI, "VanDerPol-v0"), (VDP, "DoubleIntegrator-v0"), (DI, "CartPole-v1")]
-)
-def test_unknown_id(refuses, script, env_id):
-    message = refuses("--env-id", env_id, script=script)
-    assert message.startswith(f"error: --env-id {env_id}: ") and all(known in message for known in script.ENV_IDS)
-
-
 FLOWN = ["--eval-only", "--checkpoint", ROOT / "results" / "di" / "agent.safetensors"]
 
 
@@ -1164,22 +1146,6 @@ def test_damaged_checkpoint(refuses, trained, tmp_path, kind):
 @pytest.mark.parametrize("value", [torch.nan, torch.inf])
 def test_checkpoint_with_weights_that_are_not_finite(refuses, trained, tmp_path, value):
     path = edited_checkpoint(trained, tmp_path / "bad", {"actor.0.bias": torch.full((8,), value)})
-    assert f"--checkpoint {path}: " in refuses("--eval-only", "--checkpoint", path)
-
-
-@pytest.mark.parametrize(
-    "edit",
-    [
-        {"args": {"embed_dim": 16}},
-        {"args": {"memory_length": 5}},
-        {"args": {"env_id": "DoubleIntegratorWaypoints-v0"}},
-        {"tensors": {"foreign": torch.zeros(1)}},
-        {"tensors": {"actor.0.bias": torch.zeros(9)}},
-    ],
-    ids=str,
-)
-def test_checkpoint_that_does_not_fit_its_own_args(refuses, trained, tmp_path, edit):
-    path = edited_checkpoint(trained, tmp_path / "bad", **edit)
     assert f"--checkpoint {path}: " in refuses("--eval-only", "--checkpoint", path)
 
 
