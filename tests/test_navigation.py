@@ -8,7 +8,6 @@ from functools import partial
 import gymnasium as gym
 import numpy as np
 import pytest
-import torch
 from rocket_oracle import CUTOFF
 from scipy.linalg import solve_discrete_are
 from scipy.stats import chi2, kstest
@@ -135,57 +134,6 @@ def test_a_stream_that_is_put_back_goes_on_with_the_same_noise():
     for name, stream in other.generators.items():
         stream.bit_generator.state = json.loads(json.dumps(env.generators[name].bit_generator.state))
     np.testing.assert_array_equal(env.reset()[0], other.reset()[0])
-
-
-@pytest.mark.slow
-def test_a_training_with_noise_is_resumed_bit_for_bit(tmp_path, monkeypatch):
-    """Stopped in its third update; the state holds both streams, and the policy's nominal flight is without noise."""
-    rocket = script()
-    tiny = ["--embed-dim=8", "--num-heads=2", "--num-blocks=1", "--memory-length=4", "--mlp-dim=8", "--hidden-dim=8"]
-    base = [*tiny, f"--env-id={CUTOFF}", "--num-envs=4", "--eval-starts=10", "--eval-every=0", "--num-minibatches=2"]
-    monkeypatch.chdir(tmp_path)
-    rocket.main([*base, "--total-updates=1"])
-    first = next((tmp_path / "runs").iterdir()) / "agent.safetensors"
-    flags = [f"--checkpoint={first}", "--dispersion=1", "--navigation-noise", "10", "0.1", "--total-updates=3"]
-    states = []
-    for name in ("whole", "stopped"):
-        (tmp_path / name).mkdir()
-        monkeypatch.chdir(tmp_path / name)
-        if name == "whole":
-            rocket.main([*base, *flags, "--flights-per-start=2"])
-        else:
-            stop_in_update(monkeypatch, rocket, 3)
-            with pytest.raises(KeyboardInterrupt):
-                rocket.main([*base, *flags, "--flights-per-start=2"])
-        (run,) = (tmp_path / name / "runs").iterdir()
-        if name == "stopped":
-            rocket.main([f"--resume={run}"])
-        states.append(torch.load(run / "training_state.pt", weights_only=True))
-        metrics = json.loads((run / "eval.json").read_text())
-        assert (metrics["navigation_noise_m"], metrics["navigation_noise_m_s"]) == (10, 0.1)
-    whole, resumed = states
-    assert whole["rng"][0].keys() == {"torch", "envs", "navigation", "cuda"}
-    assert whole["rng"][0]["navigation"] == resumed["rng"][0]["navigation"]
-    for part in ("agent", "average"):
-        for key, tensor in whole[part].items():
-            assert torch.equal(tensor, resumed[part][key]), key
-    energies = whole["agent"]["nominal_flight"][:, 1]
-    assert (energies[:400].diff() > 0).all()  # a noisy one would stand still wherever it falls
-    args = parse("--eval-only", f"--checkpoint={run}/agent.safetensors")
-    assert args.navigation_noise is None
-
-
-def stop_in_update(monkeypatch, rocket, number):
-    """Ctrl-C in the rollout of that update, once."""
-    fly, count = rocket.rollout, []
-
-    def rollout(*args):
-        count.append(1)
-        if len(count) == number:
-            raise KeyboardInterrupt
-        return fly(*args)
-
-    monkeypatch.setattr(rocket, "rollout", rollout)
 
 
 # --- bad input --------------------------------------------------------------------------------------------------------
