@@ -88,12 +88,6 @@ def test_shipped_gifs_are_small_and_short(result):
     assert all(1000 / 15 <= duration <= 1000 / 12 for duration in durations[:-1])
 
 
-def test_readme_begins_with_a_gif_that_is_there():
-    image = next(line for line in (ROOT / "README.md").read_text().splitlines() if line.startswith("!["))
-    path = ROOT / image[image.index("(") + 1 : image.index(")")]
-    assert path.suffix == ".gif" and path.is_file()
-
-
 @pytest.mark.parametrize("fault", ["no folder", "no npz", "other id", "short", "nan"])
 def test_bad_folders_are_one_line_and_write_nothing(fault, tmp_path, monkeypatch):
     folder = copied("rocket_cutoff", tmp_path / "run")
