@@ -1,7 +1,8 @@
 """Write docs/page.png, the picture of a flight in the browser on the front page.
 
-    pip install playwright && playwright install chromium      # or a `chromium` of the system
     python docs/page_picture.py
+
+It needs the package playwright, and its Chromium (`playwright install chromium`) or the system's.
 """
 
 import shutil
