@@ -147,7 +147,7 @@ class Bench:
         """The first minibatch's approx_kl at log-std -8."""
         self.agent.actor_logstd.data.fill_(-8.0)
         args, script = self.args, self.script
-        batch, _ = script.rollout(self.agent, self.envs, args.reward_scale, 0.0)
+        batch, _ = script.rollout(self.agent, self.envs, {}, args.reward_scale, 0.0)
         batch.advantages = batch.targets = torch.zeros_like(batch.rewards)
         mb = torch.arange(args.num_envs // args.num_minibatches, device=batch.rewards.device)
         return self.gradient(args, self.agent, batch, mb, 0.0)["approx_kl"].item()
@@ -155,7 +155,7 @@ class Bench:
     def launches(self):
         """Launches and kernels, and the kernels' milliseconds, of one minibatch and of a rollout's share of steps."""
         args, script = self.args, self.script
-        batch, _ = script.rollout(self.agent, self.envs, args.reward_scale, 0.0)
+        batch, _ = script.rollout(self.agent, self.envs, {}, args.reward_scale, 0.0)
         batch.advantages = batch.targets = torch.zeros_like(batch.rewards)
         mb = torch.arange(args.num_envs // args.num_minibatches, device=batch.rewards.device)
         cache = self.agent.start_cache(batch.memory, 8)

@@ -28,12 +28,12 @@ class OneUpdate:
 def one_update(script, args, modules, envs, batch, iteration=1, group=None):
     """Do update `iteration` of `script.train` without its rollout. Returns its losses.
 
-    modules are agent, average and optimiser. `batch` takes the place of the rollout's. With a `group` the environments
-    have no curriculum, and need only `num_envs`.
+    modules are agent, average and optimiser. `batch` takes the place of the rollout's. With a `group` there is no other
+    curriculum, and the environments need only `num_envs`.
     """
     given = {"rollout": lambda *inputs: (batch, None)}
     if group is not None:
-        given["set_curriculum"] = lambda *inputs: group
+        given["curriculum"] = lambda *inputs: {"flights_per_start": group}
     run = OneUpdate(iteration)
     with contextlib.suppress(UpdateDone), mock.patch.multiple(script, **given):
         script.train(args, *modules, envs, run)

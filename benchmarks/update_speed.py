@@ -88,8 +88,8 @@ class Workbench:
 
     def rollout(self):
         args = self.args
-        memory_noise = self.script.value_at(args.memory_noise, 0.0)
-        batch, _ = self.script.rollout(self.agent, self.envs, args.reward_scale, memory_noise)
+        memory_noise = args.memory_noise.at(0.0)
+        batch, _ = self.script.rollout(self.agent, self.envs, {}, args.reward_scale, memory_noise)
         return batch
 
     def epoch(self, batch):
@@ -220,10 +220,7 @@ def gathered_epoch(bench, batch, samples):
         ratio = (newlogprob - batch.logprobs[t, n]).exp()
         advantages = batch.advantages[t, n]
         clipped = ratio.clamp(1 - args.clip_coef, 1 + args.clip_coef)
-        loss = (
-            torch.max(-advantages * ratio, -advantages * clipped).mean()
-            - bench.script.value_at(args.ent_coef, 0.0) * entropy.mean()
-        )
+        loss = torch.max(-advantages * ratio, -advantages * clipped).mean() - args.ent_coef.at(0.0) * entropy.mean()
         loss = loss + args.vf_coef * 0.5 * (newvalue - batch.targets[t, n]).square().mean()
         bench.optimizer.zero_grad()
         loss.backward()

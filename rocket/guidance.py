@@ -93,8 +93,7 @@ def linearise_flight(mission: Mission, flight: dict, axes):
     """
     h = np.repeat([10.0, 0.01, 1e-4], [3, 3, 2])
     shifts = np.concatenate([np.diag(h), -np.diag(h)])  # (16, 8)
-    env = RocketVectorEnv(len(shifts), replace(mission, cutoff=False))
-    env.end_time = flight["t"][-1]
+    env = RocketVectorEnv(len(shifts), replace(mission, cutoff=False), end_time=flight["t"][-1])
     env.reset()
     jacobians = []
     for k, (y, u) in enumerate(zip(flight["y"], flight["u"])):

@@ -49,7 +49,7 @@ class UnevenEnvs:
         self.given_obs.append(self.rng.uniform(-1, 1, (self.num_envs, 3)))
         return self.given_obs[-1]
 
-    def reset(self, seed=None):
+    def reset(self, seed=None, options=None):
         self.t, self.sums = np.zeros(self.num_envs, dtype=int), np.zeros(self.num_envs)
         self.given_obs, self.taken_actions, self.given_rewards = [], [], []
         return self._draw(), {}

@@ -1,6 +1,6 @@
 """PPO of the scripts: GAE, groups, loss, update, schedules against sums, cases and averages written out by hand.
 
-The scripts' shared sections are the same to the letter (test_scripts.py), so one script stands for all.
+The scripts' shared sections are the same (test_scripts.py), so one script stands for all.
 """
 
 import copy
@@ -17,6 +17,7 @@ from scipy.stats import norm
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 import ppo_gtrxl_di as script
+from common.schedule import Schedule
 
 torch.set_num_threads(1)
 TINY = {"embed_dim": 8, "num_heads": 2, "mlp_dim": 8, "hidden_dim": 8, "num_blocks": 1, "memory_length": 4}
@@ -57,7 +58,7 @@ class Learner:
         self.collect()
 
     def collect(self):
-        self.batch, _ = script.rollout(self.agent, self.envs, 1.0, 0.1)
+        self.batch, _ = script.rollout(self.agent, self.envs, {}, 1.0, 0.1)
 
     def update(self, iteration=1):
         modules = self.agent, self.average, self.optimizer
@@ -113,12 +114,36 @@ def test_gae_is_the_direct_sum(gamma, lam):
 
 def test_schedule_is_linear_between_its_points():
     """Of two points at one place the second counts from there on; before the first and after the last: constant."""
-    schedule = "0.1:1 0.4:-2 0.4:8 0.9:3"
+    schedule = Schedule("0.1:1 0.4:-2 0.4:8 0.9:3")
     expected = {0.0: 1, 0.1: 1, 0.2: 0, 0.3: -1, 0.399: -1.99, 0.4: 8, 0.65: 5.5, 0.9: 3, 1.0: 3}
     for progress, value in expected.items():
-        assert script.value_at(schedule, progress) == pytest.approx(value), progress
-    assert script.value_at("0:3e-4 1:3e-5", 0.0) == 3e-4 and script.value_at("0:3e-4 1:3e-5", 1.0) == 3e-5
-    assert script.value_at(0.7, 0.3) == 0.7
+        assert schedule.at(progress) == pytest.approx(value), progress
+    updates = 21
+    found = schedule.over(updates)
+    np.testing.assert_array_equal(found, [schedule.at(k / (updates - 1)) for k in range(updates)])
+    assert Schedule("0:3e-4 1:3e-5").at(0.0) == 3e-4 and Schedule("0:3e-4 1:3e-5").at(1.0) == 3e-5
+    assert Schedule(0.7).at(0.3) == 0.7
+
+
+@pytest.mark.parametrize("plain", [1, 0.95, -1.4, 3e-4, "0:3e-4 1:3e-5", "0:-1"])
+def test_a_file_holds_a_schedule_as_number_or_words(plain):
+    """Read again it is the same schedule. One point is not a number: it is set where a number is learned."""
+    schedule = Schedule(plain)
+    assert schedule.plain == plain and type(schedule.plain) is type(plain)
+    assert Schedule(schedule.plain) == Schedule(str(schedule)) == Schedule(schedule) == schedule
+    assert schedule.has_points == (":" in str(plain))
+    assert Schedule("0:-1") != Schedule(-1) and Schedule(1) == Schedule(1.0)
+
+
+@pytest.mark.parametrize("words", ["", "x", "0:1 x", "0.5:1 0:2", "0:1 2:3", "-0.1:1", "nan:1", "0:1:2", "1 2"])
+def test_words_that_are_no_schedule(words):
+    with pytest.raises(ValueError, match=f"^{words}: must be a number, or points as 0:-1 0.4:-2 1:-6 whose places ris"):
+        Schedule(words)
+
+
+def test_a_lowered_group_keeps_its_places():
+    assert str(Schedule("0:1 0.4:1 0.4:8").replaced(8, 4)) == "0:1 0.4:1 0.4:4"
+    assert Schedule(32).replaced(32, 4) == Schedule(4)
 
 
 @pytest.mark.parametrize("name, env_id, first", [
@@ -127,8 +152,8 @@ def test_schedule_is_linear_between_its_points():
 ])  # fmt: skip
 def test_radius_curriculum(name, env_id, first):
     """From about K times the radius, geometrically, to the true one; from there on a tenth less, flown in groups."""
-    script, envs = importlib.import_module(name), gym.make_vec(env_id, num_envs=1)
-    args = script.Args(**script.RECIPES[env_id])
+    script = importlib.import_module(name)
+    args = script.Args(env_id=env_id, **script.RECIPES[env_id])
     refined = args.log_radius.places[-2]
     for progress, scale in (
         (0.0, first),
@@ -137,12 +162,13 @@ def test_radius_curriculum(name, env_id, first):
         (refined, 0.9),
         (1.0, 0.9),
     ):
-        group = script.set_curriculum(envs, args, progress)
-        assert envs.radius_scale == pytest.approx(scale, rel=0.02)
-        assert envs.bonus_width == (0.4 if progress >= refined else 0.0)
-        assert group == envs.flights_per_start == (8 if progress >= refined else 1)
-    assert script.set_curriculum(envs, script.Args(), 0.7) == 1  # the paper
-    assert envs.radius_scale == 1 and envs.bonus_width == 0
+        training = script.curriculum(args, progress)
+        assert training["radius_scale"] == pytest.approx(scale, rel=0.02)
+        assert training["bonus_width"] == (0.4 if progress >= refined else 0.0)
+        assert training["flights_per_start"] == (8 if progress >= refined else 1)
+    paper = script.curriculum(script.Args(env_id=env_id), 0.7)
+    assert paper == {"flights_per_start": 1, "radius_scale": 1, "bonus_width": 0}
+    assert script.curriculum(script.Args(), 0.7) == {"flights_per_start": 1}  # no circles
 
 
 @pytest.mark.parametrize("std, dispersion, scale", [
@@ -150,13 +176,13 @@ def test_radius_curriculum(name, env_id, first):
 ])  # fmt: skip
 def test_the_rockets_curriculum(std, dispersion, scale):
     """R_terminal's scale is an eighth of the noise, within its bounds; guidance and groups are those of the flags."""
-    rocket, envs = importlib.import_module("ppo_gtrxl_rocket"), gym.make_vec("RocketAscentCutoff-v0", num_envs=1)
+    rocket = importlib.import_module("ppo_gtrxl_rocket")
     log_std = f"0:0.2 0.5:{math.log(std)} 1:-7"
     args = rocket.Args(guidance=True, flights_per_start=16, dispersion=dispersion, log_std=log_std)
-    assert rocket.set_curriculum(envs, args, 0.5) == envs.flights_per_start == 16
-    assert envs.guidance and envs.terminal_scale == pytest.approx(scale)
-    rocket.set_curriculum(envs, rocket.Args(), 0.5)  # the paper
-    assert envs.flights_per_start == 1 and envs.terminal_scale == 0.005 and not envs.guidance
+    training = rocket.curriculum(args, 0.5)
+    assert training == {"flights_per_start": 16, "guidance": True, "terminal_scale": pytest.approx(scale)}
+    paper = rocket.curriculum(rocket.Args(), 0.5)
+    assert paper == {"flights_per_start": 1, "guidance": False, "terminal_scale": 0.005}
 
 
 @pytest.mark.parametrize("asked", ["random", "ignition"])
@@ -167,8 +193,7 @@ def test_every_second_update_of_random_failures_flies_those_at_the_last_ignition
     envs = gym.make_vec("RocketAscentCutoff-v0", num_envs=40, **options)
     args = rocket.Args(**options, total_updates=300)
     for before in (*range(6), 298, 299):
-        rocket.set_curriculum(envs, args, before / 299)
-        envs.reset(seed=before)
+        envs.reset(seed=before, options={"training": rocket.curriculum(args, before / 299)})
         groups, moments, _ = envs.unwrapped.vehicles.failure[:, envs.unwrapped.vehicles.failure[0] >= 0]
         at_ignition = set(groups) == {3} and np.ptp(moments) == 0
         assert at_ignition == (asked == "ignition" or before % 2 == 1)
@@ -209,13 +234,12 @@ def test_memory_noise_half_way(learner, monkeypatch):
     class Asked(Exception):
         pass
 
-    def rollout(agent, envs, reward_scale, memory_noise):
+    def rollout(agent, envs, training, reward_scale, memory_noise):
         raise Asked(memory_noise)
 
     def of_update(iteration, **changes):
         run, start = learner(total_updates=11, **changes), SimpleNamespace(updates_done=iteration - 1)
         with monkeypatch.context() as patch, pytest.raises(Asked) as asked:
-            patch.setattr(script, "set_curriculum", lambda *inputs: 1)
             patch.setattr(script, "rollout", rollout)
             script.train(run.args, run.agent, run.average, run.optimizer, run.envs, start)
         return asked.value.args[0]
@@ -257,14 +281,6 @@ def test_learned_noise_stays_where_it_can_be_learned(learner):
     run.collect()
     script.set_log_std(run.agent, run.args, 0.5)
     assert run.agent.actor_logstd.item() == 0.5
-
-
-def test_noise_reaches_minus_eight(learner):
-    """The policy samples with what the schedule ends at: a standard deviation of 3e-4."""
-    run = learner(log_std="0:-1 1:-8", total_updates=2)
-    assert log_stds(run, 2) == pytest.approx([-1.0, -8.0])
-    std = run.agent.get_policy(torch.zeros(1, 8, dtype=torch.float64)).stddev
-    assert std.item() == pytest.approx(math.exp(-8.0))
 
 
 @pytest.mark.parametrize("log_std", [-0.5, "0:-0.5"])
@@ -336,23 +352,6 @@ def test_one_flight_a_start_is_the_papers(learner):
     assert run.update()["baseline_explained_variance"] == 0.0
 
 
-def test_explained_variance_is_the_critics_alone(learner):
-    """Rewards follow the clock and nothing that is seen: a critic of 0 explains nothing, the baseline nearly all."""
-    run = learner([6] * 40, flights_per_start=40)
-    run.batch.critic.zero_()
-    run.batch.rewards[:] = torch.arange(6.0)[:, None] + 0.1 * torch.randn(6, 40)
-    losses = run.update()
-    assert abs(losses["explained_variance"]) < 0.01 < 0.95 < losses["baseline_explained_variance"] <= 1
-
-
-def test_explained_variance_of_a_critic_that_knows(learner):
-    run = learner([6] * 8, flights_per_start=4, gamma=1.0, gae_lambda=1.0)
-    baseline, scale = script.returns_baseline(run.batch, 1.0, 4)
-    returns, _ = script.gae(run.batch.rewards, torch.zeros(6, 8), run.batch.alive, 1.0, 1.0)
-    run.batch.critic = (returns - baseline) / scale
-    assert run.update()["explained_variance"] == pytest.approx(1.0)
-
-
 def test_linear_fit_finds_a_line():
     """float32 states of 1e6 with differences of 100, and a column without any: y is found again within a per cent."""
     rng = np.random.default_rng(0)
@@ -360,33 +359,6 @@ def test_linear_fit_finds_a_line():
     y = 3.0 + 0.02 * (x[..., 0] - 6e6) - 4 * x[..., 1]
     fit = script.linear_fit(*(torch.tensor(array, dtype=torch.float32) for array in (x, y, np.ones((5, 64)))))
     assert fit.dtype == torch.float32 and np.abs(fit.numpy() - y).max() < 0.01 * np.ptp(y)
-
-
-def fitted(x, y):
-    """`linear_fit` of one group, x (G, k), all of it alive."""
-    return script.linear_fit(*(torch.tensor(array[None]) for array in (x, y, np.ones(len(y)))))[0].numpy()
-
-
-def test_residual_is_a_part_of_the_leave_one_out_one_without_states():
-    """The states are all alike, so the ridge has nothing to hold: (1 - 1 / G) of the distance to the others' mean."""
-    y = np.random.default_rng(0).standard_normal(8)
-    others = np.array([np.delete(y, n).mean() for n in range(8)])
-    np.testing.assert_allclose(y - fitted(np.full((8, 3), 7.0), y), (1 - 1 / 8) * (y - others), rtol=1e-9)
-
-
-def test_residual_is_a_part_of_the_leave_one_out_one():
-    """(1 - h) times the residual of the same fit without the episode, and h, its own share in its fit, does not hang on
-    the returns: the baseline takes part of an action's effect away, but turns no state's gradient round."""
-    rng, G, k = np.random.default_rng(0), 12, 3
-    x, y = rng.standard_normal((G, k)), rng.standard_normal(G)
-    design, penalty = np.column_stack([np.ones(G), standardised(x)]), 0.01 * G * np.diag([0.0, 1.0, 1.0, 1.0])
-    for n in range(G):
-        rows, rest = np.delete(design, n, axis=0), np.delete(y, n)
-        without = design[n] @ np.linalg.solve(rows.T @ rows + penalty, rows.T @ rest)
-        bump = np.eye(G)[n]
-        h, h_of_others = fitted(x, y + bump)[n] - fitted(x, y)[n], fitted(x, bump)[n]
-        assert h == pytest.approx(h_of_others, rel=1e-9) and 0 < h < 1
-        assert (y - fitted(x, y))[n] == pytest.approx((1 - h) * (y[n] - without), rel=1e-6)
 
 
 @pytest.mark.parametrize("group", [1, 2])
@@ -401,8 +373,7 @@ def test_flights_of_a_group_share_their_start_and_nothing_else(env_id):
     args = make_args(env_id=env_id, flights_per_start=3)
     envs = gym.make_vec(env_id, num_envs=6)
     envs.reset(seed=1)
-    script.set_curriculum(envs, args, 0.0)
-    batch, _ = script.rollout(make_agent(args, envs), envs, 1.0, 0.1)
+    batch, _ = script.rollout(make_agent(args, envs), envs, script.curriculum(args, 0.0), 1.0, 0.1)
     first, second = batch.obs[0, :3], batch.obs[0, 3:]
     assert (first == first[0]).all() and (second == second[0]).all() and (first[0, :2] != second[0, :2]).all()
     for own in (batch.actions[0, :, 0], batch.logprobs[0], batch.obs[1, :, 1], batch.rewards[1]):
@@ -507,19 +478,6 @@ def test_minibatches_cover_each_episode_once_an_epoch(learner, asked):
     assert len({tuple(epoch) for epoch in epochs}) > 1  # shuffled anew
 
 
-@pytest.mark.parametrize("norm_adv", [True, False])
-def test_advantages_are_normalised_over_living_steps(learner, norm_adv):
-    run = learner(norm_adv=norm_adv)
-    rewards, values = run.batch.rewards.numpy(), run.batch.critic.numpy()
-    expected = direct_gae(rewards, values, run.envs.lengths, 0.99, 0.95)
-    alive = np.arange(6)[:, None] < run.envs.lengths
-    run.update()
-    np.testing.assert_allclose(run.batch.targets.numpy()[alive], (expected + values)[alive], atol=1e-9)
-    living = expected[alive]
-    living = (living - living.mean()) / living.std() if norm_adv else living
-    np.testing.assert_allclose(run.batch.advantages.numpy()[alive], living, rtol=1e-6, atol=1e-9)
-
-
 def test_update_returns_means_over_all_minibatches(learner, monkeypatch):
     """STYLE: losses are means over the update, not the last minibatch; the explained variance is of the old values."""
     logged, loss = [], script.ppo_loss
@@ -535,46 +493,6 @@ def test_update_returns_means_over_all_minibatches(learner, monkeypatch):
     assert returned["explained_variance"] == pytest.approx(expected)
 
 
-def test_first_minibatch_has_ratio_one(learner):
-    """Nothing has moved yet: rollout's log-probabilities are training's, KL 0 and nothing clipped."""
-    losses = learner(num_minibatches=1, update_epochs=1).update()
-    assert abs(losses["approx_kl"]) < 1e-12 and losses["clipfrac"] == 0
-
-
-def test_average_is_the_exponential_one(learner):
-    """w_1, then D average + (1 - D) w_k after every optimiser step, recomputed from the recorded weights."""
-    run = learner()
-    run.update()
-    assert len(run.optimizer.weights) == 6
-    for name, tensor in run.average.module.state_dict().items():
-        average = run.optimizer.weights[0][name]
-        for weights in run.optimizer.weights[1:]:
-            average = 0.9 * average + (1 - 0.9) * weights[name]
-        torch.testing.assert_close(tensor, average, rtol=1e-12, atol=1e-12)
-    assert (run.average.module.actor[0].weight != run.agent.actor[0].weight).any()
-
-
-def test_gradient_norm_is_limited(learner, monkeypatch):
-    norms, step = [], torch.optim.Adam.step
-
-    def spy(optimizer):
-        gradients = [p.grad.flatten() for p in optimizer.param_groups[0]["params"]]
-        norms.append(torch.cat(gradients).norm().item())
-        return step(optimizer)
-
-    monkeypatch.setattr(torch.optim.Adam, "step", spy)
-    learner(max_grad_norm=1e-3).update()
-    assert len(norms) == 6 and max(norms) == pytest.approx(1e-3, rel=1e-3)
-
-
-@pytest.mark.parametrize("target_kl, steps", [(None, 10), (1e9, 10), (1e-9, 1)])
-def test_target_kl_ends_the_update_at_once(learner, target_kl, steps):
-    """The first minibatch has KL 0; the one whose KL is beyond the limit takes no step, whatever epoch it is in."""
-    run = learner(target_kl=target_kl, update_epochs=5)
-    run.update()
-    assert len(run.optimizer.weights) == steps
-
-
 def test_a_minibatch_beyond_the_limit_ends_the_update(learner, monkeypatch):
     """Also if the next ones would be within it."""
     run, loss = learner((6, 2, 5, 1), target_kl=0.5, update_epochs=5), script.ppo_loss
@@ -587,15 +505,6 @@ def test_a_minibatch_beyond_the_limit_ends_the_update(learner, monkeypatch):
     monkeypatch.setattr(script, "ppo_loss", prescribed)
     run.update()
     assert len(run.optimizer.weights) == 1
-
-
-def test_nan_reward_stops_before_the_weights_move(learner):
-    run = learner()
-    run.batch.rewards[2, 0] = torch.nan
-    before = copy.deepcopy(run.agent.state_dict())
-    with pytest.raises(FloatingPointError, match="policy_loss is nan in epoch 1, minibatch 1"):
-        run.update()
-    torch.testing.assert_close(run.agent.state_dict(), before, rtol=0, atol=0)
 
 
 def test_nan_loss_names_term_epoch_and_minibatch(learner, monkeypatch):
@@ -631,28 +540,8 @@ def test_rewards_are_scaled_in_training_and_logged_unscaled():
     args = make_args()
     envs = gym.make_vec(args.env_id, num_envs=3)
     envs.reset(seed=1)
-    batch, episodes = script.rollout(make_agent(args, envs), envs, 0.1, 0.1)
+    batch, episodes = script.rollout(make_agent(args, envs), envs, {}, 0.1, 0.1)
     assert batch.rewards.shape == (50, 3) and batch.alive.all()
     np.testing.assert_allclose(batch.rewards.sum(0) / 0.1, episodes["episodic_return"], rtol=1e-9)
     x, v, u = batch.obs[..., 0], batch.obs[..., 1], batch.actions[..., 0].clip(-4, 4)
     np.testing.assert_allclose(batch.rewards[:-1], -0.1 * (x**2 + v**2 + 0.1 * u**2)[:-1], rtol=1e-9)  # the paper's
-
-
-def test_one_step_bandit(uneven_envs):
-    """Reward -(a - 1)^2: one update makes a = 1 likelier, twenty move the mean to it."""
-    envs = uneven_envs([1] * 64, reward=lambda action: -((action[:, 0] - 1) ** 2))
-    run = Learner(envs, num_minibatches=2, update_epochs=4, learning_rate=1e-2)
-
-    def best_action():
-        hidden = run.agent.encode(run.batch.obs.transpose(0, 1), run.batch.memory)
-        logprob = run.agent.evaluate_actions(hidden, torch.ones(64, 1, 1, dtype=torch.float64))[0]
-        return logprob.mean().item(), run.agent.get_mean_action(hidden).mean().item()
-
-    first_logprob, first_mean = best_action()
-    run.update()
-    assert best_action()[0] > first_logprob
-    assert abs(first_mean) < 0.2
-    for _ in range(20):
-        run.collect()
-        run.update()
-    assert best_action()[1] == pytest.approx(1.0, abs=0.15)
