@@ -1,6 +1,6 @@
 """Try to hurt a run from outside: kills, damaged files, absurd flags and actions, two thousand updates.
 
-    python benchmarks/robustness.py [--kills 50] [--fuzz 10000] [--soak 2000] [--seed 0]
+    python -m benchmarks.robustness [--kills 50] [--fuzz 10000] [--soak 2000] [--seed 0]
 
 Prints what was tried and how it ended. The first failure is an AssertionError. The tests do the same, but fewer times.
 """
@@ -30,16 +30,14 @@ import gymnasium as gym
 import numpy as np
 import torch
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
-import envs  # noqa: E402
-import runs  # noqa: E402
-from common import files  # noqa: E402
-from common.checkpoints import read_checkpoint  # noqa: E402
-from common.command_line import OneLineParser, integer  # noqa: E402
-from common.tasks import env_ids  # noqa: E402
+import envs
+import runs
+from benchmarks.policies import SCRIPTS
+from common import files
+from common.checkpoints import read_checkpoint
+from common.command_line import OneLineParser, integer
+from common.tasks import env_ids
 
-SCRIPTS = [importlib.import_module(path.stem) for path in sorted(ROOT.glob("ppo_gtrxl_*.py"))]
 NETWORK = ["--embed-dim=8", "--num-heads=2", "--num-blocks=1", "--memory-length=4", "--mlp-dim=8", "--hidden-dim=8"]
 TINY = [*NETWORK, "--num-envs=2", "--num-minibatches=2", "--update-epochs=2", "--eval-starts=10", "--num-threads=1"]
 PROCESSES = multiprocessing.get_context("forkserver")  # its children have torch already: each starts at once
