@@ -10,13 +10,13 @@ import subprocess
 import tomllib
 from pathlib import Path
 
-import memory
 import numpy as np
 import pytest
 
 import baselines
 import envs
 import runs
+from benchmarks import memory
 from common.checkpoints import read_checkpoint
 from phased.problem import flights_of_seed
 
@@ -83,6 +83,7 @@ def test_commands_name_what_is_there(page):
     """Scripts and lists exist, and scripts that train accept the flags and their values."""
     for words in command_lines(page):
         files = [word for word in words if word.endswith((".py", ".txt"))]
+        files += [f"{word.replace('.', '/')}.py" for word in words if word.startswith("benchmarks.")]
         assert all((ROOT / word).exists() for word in files), words
         # the reader's rocket is no id here
         if not files or not files[0].startswith("ppo_gtrxl") or {"MyRocket-v0", "--help"} & set(words):
@@ -236,7 +237,7 @@ MEMORY_TABLES = {  # by the head's beginning: the experiment, and the columns th
 
 @pytest.mark.parametrize("heading", MEMORY_TABLES)
 def test_the_memorys_tables_are_those_of_the_results(heading):
-    """Medians and ranges over the seeds of results/memory, by the rows and keys that benchmarks/memory.py prints."""
+    """Medians and ranges over the seeds of results/memory, by the rows and keys that benchmarks.memory prints."""
     name, columns = MEMORY_TABLES[heading]
     experiment = memory.EXPERIMENTS[name]
     found = memory.read(ROOT / "results" / "memory" / name, experiment)

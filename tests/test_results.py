@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import run_seeds
 import safetensors
 
 import envs
+from benchmarks import run_seeds
 from common import curves
 
 ROOT = Path(__file__).parent.parent
@@ -45,7 +45,7 @@ def test_a_policy_was_trained_by_the_command_that_its_list_gives(folder, monkeyp
     """All arguments, those that the recipe sets, too. The command is an id and a seed, but for the GPU's."""
     monkeypatch.chdir(ROOT)  # a command names a policy of results/
     on_gpu = folder.name == "rocket_paper"
-    jobs = run_seeds.read_jobs("benchmarks/gpu_jobs.txt" if on_gpu else "benchmarks/result_jobs.txt")
+    jobs = run_seeds.read_trainings("benchmarks/trainings/gpu.txt" if on_gpu else "benchmarks/trainings/results.txt")
     (job, *_) = [job for job in jobs if job.results.name == folder.name]
     with safetensors.safe_open(folder / "agent.safetensors", "pt") as file:
         args = json.loads(file.metadata()["args"])
@@ -64,8 +64,8 @@ def test_a_policy_was_trained_by_the_command_that_its_list_gives(folder, monkeyp
 def test_held_out_runs_are_the_results_commands_with_other_seeds(monkeypatch):
     """Two a row, no seed twice; all are measured on the starts and draws of one seed that no result has."""
     monkeypatch.chdir(ROOT)
-    shipped = {job.results.name: job.args for job in run_seeds.read_jobs("benchmarks/result_jobs.txt")}
-    held_out = run_seeds.read_jobs("benchmarks/held_out_jobs.txt")
+    shipped = {job.results.name: job.args for job in run_seeds.read_trainings("benchmarks/trainings/results.txt")}
+    held_out = run_seeds.read_trainings("benchmarks/trainings/held_out.txt")
     assert sorted(job.results.name for job in held_out) == sorted(2 * list(shipped))
     for job in held_out:
         assert job.results.parent.name == "held_out"

@@ -6,7 +6,8 @@ import sys
 from pathlib import Path
 
 import pytest
-import run_seeds
+
+from benchmarks import run_seeds
 
 ROOT = Path(__file__).parents[1]
 sys.path.append(str(ROOT / "docs"))
@@ -83,7 +84,7 @@ def test_the_table_of_held_out_runs_is_that_of_the_results():
     text = (ROOT / "docs" / "results.md").read_text()
     assert script_pages.with_held_out_rows(text) == text
     assert script_pages.with_held_out_rows(text.replace("| 1.0002 (", "| 1.0003 (")) == text
-    jobs = run_seeds.read_jobs(ROOT / "benchmarks" / "held_out_jobs.txt")
+    jobs = run_seeds.read_trainings(ROOT / "benchmarks" / "trainings" / "held_out.txt")
     for result in script_pages.HELD_OUT:
         trained = {int(path.stem) for path in (ROOT / "results" / "held_out" / result).glob("seeds/*.json")}
         assert trained <= {job.args["seed"] for job in jobs if job.results.name == result}
