@@ -63,7 +63,10 @@ def differing(one, other):
 
 def first_trainings():
     """{results folder: its first training} of the list of results."""
-    return {str(training.results): training for training in reversed(read_trainings(RESULTS))}
+    first = {}
+    for training in read_trainings(RESULTS):
+        first.setdefault(str(training.results), training)
+    return first
 
 
 def results_folder(text):

@@ -1,4 +1,4 @@
-"""`benchmarks.speed`: an update's figures, gathered windows against the scripts, a training beside its shipped curve."""
+"""`benchmarks.speed`: an update's figures, gathered windows against the scripts, a training beside its shipped run."""
 
 import csv
 import re
