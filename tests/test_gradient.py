@@ -278,7 +278,7 @@ def test_a_record_is_a_line_of_the_table(tmp_path, monkeypatch, capsys):
     assert ppo[1:4] == ["5", "its flights", "32000"] and ppo[5].startswith(f"{np.median(seeds):.5g} (")
     assert len(capsys.readouterr().out.splitlines()[-1].split()) > 5
     (tmp_path / "gradient_di_1.json").write_text("{}")
-    with pytest.raises(ValueError, match="gradient_di_1.json is not what gradient.py writes"):
+    with pytest.raises(ValueError, match="gradient_di_1.json is no record of a training"):
         gradient.table(tmp_path)
 
 
