@@ -70,7 +70,7 @@ def read_checkpoint(
     return {"args": args, "progress": progress, "tensors": tensors}
 
 
-def types_of(kind: type | UnionType) -> tuple[type, ...]:
+def types_of(kind) -> tuple[type, ...]:
     """The types of which an annotation such as `float | None` consists."""
     return get_args(kind) or (kind,)
 
