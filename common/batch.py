@@ -25,10 +25,12 @@ def numeric(default, low: float = 0.0, high: float = np.inf):
     """A field of `Training` that is a finite number from low to high. If `default` is None, it may be None, too."""
 
     def fits(value):
-        return (value is None and default is None) or (is_finite(value) and low <= value <= high)
+        if value is None:
+            return default is None
+        return is_finite(value) and low <= value <= high
 
     allowed = f"must be a number from {low:g} to {high:g}" if high < np.inf else f"must be a number of at least {low:g}"
-    return field(default=default, metadata={"fits": fits, "allowed": allowed})
+    return checked(default, fits, allowed)
 
 
 def checked(default, fits: Callable, allowed: str):
@@ -38,7 +40,7 @@ def checked(default, fits: Callable, allowed: str):
 
 def is_group(size) -> bool:
     """Whether `size` is a number of flights."""
-    return isinstance(size, int | np.integer) and size >= 1
+    return isinstance(size, int | np.integer) and bool(size >= 1)
 
 
 @dataclass(frozen=True)
