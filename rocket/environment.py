@@ -19,6 +19,7 @@ from gymnasium.vector import AutoresetMode
 
 from common.batch import RENDERED, BatchedEnv, SingleEnv, check_options, of_batch, refuse_autoreset
 from common.errors import BadInput, refuse_unless
+from common.flying import fly_until_ended
 from common.integration import rk4
 from rocket.dispersion import (
     DISPERSION,
@@ -125,13 +126,13 @@ class RocketVectorEnv(BatchedEnv):
     Reward: the sum of R_orbital, R_trajectory, R_guidance, R_penalties and R_terminal, which are functions of
     `rewards.py`. `final_info` has, (N,) each unless a shape is given:
 
+    - `final_y` (N, 7), the exact r, v and m
     - `error_norm`, and `error` (N, 6), the terminal error in ECI
     - `a_km e i_deg raan_deg argp_deg final_mass_kg final_time_s`
     - `max_altitude_km`, of the steps' ends
     - the sums of the five parts, `episodic_return`, `points` (`precision_points`) and `crashed`
     - with dispersion or failures `draw` (N, k), and `dry` for a flight that is out of fuel
     - with failures `failure` (N, 3): group of engines, moment (s) and share lost; -1, 0, 0 for a healthy flight
-    - with navigation noise `final_y` (N, 7), the exact r, v and m
 
     A training may set these attributes before a `reset`:
 
@@ -602,7 +603,7 @@ class RocketVectorEnv(BatchedEnv):
         error = terminal_error(y, self.rocket)
         elements = orbital_elements(y, self.rocket.mu)
         error_norm = np.sqrt((error * error).sum(axis=1))
-        info = {"error": error, "error_norm": error_norm, "a_km": elements.a / 1e3, "e": elements.e}
+        info = {"final_y": y.copy(), "error": error, "error_norm": error_norm, "a_km": elements.a / 1e3, "e": elements.e}
         info |= {f"{name}_deg": np.degrees(getattr(elements, name)) for name in ("i", "raan", "argp")}
         info |= {"final_mass_kg": self.y[6].copy(), "final_time_s": self.time.copy(), "crashed": self._crashed.copy()}
         info |= {"max_altitude_km": self._max_altitude / 1e3, "points": precision_points(error_norm)}
@@ -610,8 +611,6 @@ class RocketVectorEnv(BatchedEnv):
             info |= {"draw": self.draw.copy(), "dry": self.time >= self.vehicles.burn_out - 1e-6}
         if self.failure:
             info["failure"] = self.vehicles.failure.T.copy()
-        if self.navigation_noise:
-            info["final_y"] = y.copy()
         return info | dict(zip(self.PARTS, self._parts.copy())) | {"episodic_return": self._parts.sum(axis=0)}
 
     def _snapshot(self):
@@ -696,15 +695,15 @@ def fly_rocket(
     obs, _ = env.reset(options=given)
     t, y = [0.0], [env.y[:, 0].copy()]
     u, rewards, parts = [], [], []
-    final = {}
-    while not final:
-        obs, reward, _, final = env.advance(policy(obs, len(u)))
+
+    def record(step):
         t.append(env.time[0])
         u.append(env.u[:, 0])
         y.append(env.y[:, 0].copy())
-        rewards.append(reward[0])
+        rewards.append(step.reward[0])
         parts.append(env._parts[:, 0].copy())
-    final = {key: value[0] for key, value in final.items()}
+
+    final = {key: value[0] for key, value in fly_until_ended(env, policy, obs, record).items()}
     flight = {"t": np.array(t), "u": np.array(u), "y": np.array(y), "reward": np.array(rewards)}
     return {**flight, "parts": np.array(parts), **final}
 
