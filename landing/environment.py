@@ -16,7 +16,7 @@ from common.batch import RENDERED, BatchedEnv, SingleEnv, check_options, of_batc
 from common.errors import BadInput, is_finite, refuse_unless
 from common.flying import fly_until_ended
 from landing.dynamics import Arc
-from landing.lander import DRAW, LANDERS, Flights, Lander, check_failure, flights
+from landing.lander import DRAW, LANDERS, Flights, Lander, check_failure, draw_flights
 from landing.rewards import (
     ALOFT_PRICE,
     FUEL_PRICE,
@@ -146,7 +146,7 @@ class LanderVectorEnv(BatchedEnv):
 
     def _drawn(self, draw) -> Flights:
         failure = self.failure_probability, self.failure_size, self.failure_time
-        return flights(self.lander, draw, *failure, self.start_spread)
+        return draw_flights(self.lander, draw, *failure, self.start_spread)
 
     def _observation_space(self):
         """The box that holds every observation."""

@@ -209,7 +209,7 @@ def test_near_the_target_the_error_is_corrected_and_the_mass_grows(monkeypatch):
     start = 1e-3 * torch.randn(20)
     agent.weight.data[:] = start
     monkeypatch.setattr(gradient, "weights_of", lambda agent: [agent.weight])
-    monkeypatch.setattr(gradient, "fly", lambda agent, env: gradient.Flights(*[None] * 4, crashed=False))
+    monkeypatch.setattr(gradient, "fly", lambda agent, env: gradient.Flown(*[None] * 4, crashed=False))
     outcome = lambda agent, *_: ((world @ agent.weight[0].detach())[None], world[None])  # noqa: E731
     monkeypatch.setattr(gradient, "derivative", outcome)
     gradient.train_rocket(agent, None, gradient.Recipe(updates=30, flights=1, learning_rate=1e-3), gradient.Curve())
@@ -223,7 +223,7 @@ def test_half_of_a_step_into_the_ground_is_taken_back(monkeypatch):
     agent = torch.nn.Linear(1, 1, bias=False)
     agent.weight.data[:] = 0.9
     monkeypatch.setattr(gradient, "weights_of", lambda agent: [agent.weight])
-    fly = lambda agent, env: gradient.Flights(*[None] * 4, crashed=bool(agent.weight > 1))  # noqa: E731
+    fly = lambda agent, env: gradient.Flown(*[None] * 4, crashed=bool(agent.weight > 1))  # noqa: E731
     monkeypatch.setattr(gradient, "fly", fly)
     monkeypatch.setattr(gradient, "derivative", lambda *_: (torch.full((1, 7), -1.0), torch.ones(1, 7, 1)))
     gradient.train_rocket(agent, None, gradient.Recipe(updates=40, flights=1, learning_rate=0.1), gradient.Curve())

@@ -431,9 +431,9 @@ def test_cart_pole_by_two_transcriptions(new_problem):
     one = replace(kelly, env_id="KellyLine-v0")
     new_problem(one)
     x0, draw = flights_of_seed(one, 0, 1)
-    job = phased_optimum.Job(one.env_id, phased_optimum.shooting, True, 0, x0[0], draw[0])
+    job = phased_optimum.StartJob(one.env_id, phased_optimum.shooting, True, 0, x0[0], draw[0])
     line = list(phased_optimum.guesses(one, x0[0], draw[0]))[1]
-    coarse = phased_optimum.solve_on(one, phased_optimum.Mesh.of(one), job, line)
+    coarse = phased_optimum.solve_on(one, phased_optimum.PhaseMesh.of(one), job, line)
     sketches = phased_optimum.sketches_of(one, coarse.mesh, x0[0], coarse.unknowns)
     fine = phased_optimum.solve_on(one, coarse.mesh.refined(4), job, sketches)
     assert fine.succeeded and fine.cost == pytest.approx(58.82, abs=0.03)
