@@ -142,7 +142,7 @@ def landing_solver(lander: Lander, count: int, has_cone: bool):
     """IPOPT for a landing in `count` intervals, built once per process.
 
     - unknowns: the thrusts (3, count), the states (7, count) at the intervals' ends, the length of the free intervals
-    - parameters: state, gravity, effectiveness (3, count), `LandingMesh.fixed`, `LandingMesh.is_free`, the glide slope's tangent
+    - parameters: state, gravity, effectiveness (3, count), `fixed` and `is_free` of the mesh, the glide slope's tangent
     - cost: the propellant
     - constraints: continuous states (7 count, = 0), |thrust|^2 and |command|^2 (count each, bounded), and with
       `has_cone` the heights above the cone at the ends of all intervals but the last (count - 1)
