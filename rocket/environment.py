@@ -389,7 +389,8 @@ class RocketVectorEnv(BatchedEnv):
         """The steps that the environments fly next."""
         if self._table is None:
             return steps_at(self.t, self.vehicles, self._latest, self.dt)
-        return self._table.of(self.t)._replace(who=self._everyone)
+        table, t = self._table, self.t
+        return Steps(table.begin[t], table.end[t], table.arc[t], self._everyone)
 
     def _computed_mass(self):
         """The flight computer's mass (N,) in kg. It follows the nominal burn from the last staging on."""
