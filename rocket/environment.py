@@ -232,7 +232,7 @@ class RocketVectorEnv(BatchedEnv):
         # without draws all flights have the same steps, which are worked out once for the one vehicle
         self._table = None
         if not self.has_draws:
-            self._table = steps_at(np.arange(self.episode_steps + 1), self._largest, self._latest, self.dt)
+            self._table = steps_at(np.arange(self.episode_steps + 1), self._largest, self._latest, self._steps, self.dt)
         self._set_ends(self.vehicles)
 
     def _set_ends(self, vehicles):
@@ -388,7 +388,7 @@ class RocketVectorEnv(BatchedEnv):
     def _running_steps(self) -> Steps:
         """The steps that the environments fly next."""
         if self._table is None:
-            return steps_at(self.t, self.vehicles, self._latest, self.dt)
+            return steps_at(self.t, self.vehicles, self._latest, self._steps, self.dt)
         table, t = self._table, self.t
         return Steps(table.begin[t], table.end[t], table.arc[t], self._everyone)
 

@@ -47,9 +47,11 @@ def steps_until(latest: np.ndarray, dt: float) -> np.ndarray:
     return np.maximum(np.ceil(latest / dt - 1e-9), 1.0).astype(np.int64)
 
 
-def steps_at(t, vehicles: Vehicles, latest: np.ndarray, dt: float) -> Steps:
-    """The steps t (N,) of flights that end at `latest` (N,) s. After a flight's last step its arc keeps its value."""
-    count = steps_until(latest, dt)
+def steps_at(t, vehicles: Vehicles, latest: np.ndarray, count: np.ndarray, dt: float) -> Steps:
+    """The steps t (N,) of flights that end at `latest` (N,) s, after `count` = `steps_until(latest, dt)` steps.
+
+    After a flight's last step its arc keeps its value.
+    """
     begin = np.where(t >= count, latest, dt * t)
     end = np.where(t + 1 >= count, latest, dt * (t + 1))
     arc = (vehicles.end <= dt * np.minimum(t, count - 1)).sum(axis=0)

@@ -28,7 +28,7 @@ from common.ipopt import interruptible
 from common.workers import Workers
 from rocket.dispersion import draw_vehicles, nominal_vehicles
 from rocket.dynamics import ascent_dynamics
-from rocket.flight import Fleet, fly_step, steps_at, unit_directions
+from rocket.flight import Fleet, fly_step, steps_at, steps_until, unit_directions
 from rocket.missions import ROCKETS, Mission
 from rocket.optimum import (
     GAUSS_POINTS,
@@ -92,11 +92,13 @@ def linearise_flight(mission: Mission, flight: dict, axes):
     """
     h = np.repeat([10.0, 0.01, 1e-4], [3, 3, 2])
     shifts = np.concatenate([np.diag(h), -np.diag(h)])  # (16, 8)
+    dt = mission.rocket.dt
     fleet = Fleet(mission.rocket, nominal_vehicles(mission.rocket, len(shifts)), has_own_air=False)
     latest = np.full(len(shifts), flight["t"][-1])
+    count = steps_until(latest, dt)
     jacobians = []
     for k, (y, u) in enumerate(zip(flight["y"], flight["u"])):
-        steps = steps_at(k, fleet.vehicles, latest, mission.rocket.dt)
+        steps = steps_at(k, fleet.vehicles, latest, count, dt)
         y_near = y[:, None] + np.pad(shifts[:, :6], ((0, 0), (0, 1))).T
         u_near = unit_directions(turned(u, axes[k], shifts[:, 6:]))
         y_next = fly_step(fleet, y_near, u_near, steps, steps.end - steps.begin)
