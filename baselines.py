@@ -36,7 +36,7 @@ from common.tasks import add_family, env_ids, task_of
 from common.workers import Workers
 from envs import DOUBLE_INTEGRATOR, PROBLEMS, Problem, fly
 from phased.lqr import linearise, lqr, lqr_policy, riccati
-from phased.optimum import Job, best_solution, hermite_simpson, refined, shooting
+from phased.optimum import StartJob, best_solution, hermite_simpson, refined, shooting
 from phased.problem import flights_of_seed, starts
 from phased.task import PhasedTask
 from rocket.optimum import rocket_reference
@@ -93,7 +93,7 @@ def box_qp(problem: Problem, x0):
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def _solve_start(job: Job):
+def _solve_start(job: StartJob):
     """Solve one start: control (T, m), the cost, whether there is a solution, and the circles' multipliers."""
     problem = PROBLEMS[job.env_id]
     best, exists = best_solution(job)
@@ -126,7 +126,7 @@ def optimise(
     _, first, of_start = np.unique(np.hstack([x0, draw]), axis=0, return_index=True, return_inverse=True)
     order = np.argsort(first)  # in the order of the starts, so that an error names the first one
     rank = np.argsort(order)
-    jobs = [Job(env_id, defect, in_circles, int(k), x0[k], draw[k]) for k in first[order]]
+    jobs = [StartJob(env_id, defect, in_circles, int(k), x0[k], draw[k]) for k in first[order]]
     if processes is None:
         processes = max(1, min(os.cpu_count() or 1, len(jobs) // STARTS_PER_PROCESS))
     with Workers(processes) as workers:
@@ -329,7 +329,7 @@ def compare_finer(env_id: str, x0, flight: dict, draw) -> dict:
     """
     problem = PROBLEMS[env_id]
     some = range(min(len(x0), FINER_STARTS))
-    jobs = [Job(env_id, shooting, problem.circles_count, k, x0[k], draw[k]) for k in some]
+    jobs = [StartJob(env_id, shooting, problem.circles_count, k, x0[k], draw[k]) for k in some]
     best = [best_solution(job)[0] for job in jobs]
     numbers = {}
     if problem.bounds:

@@ -9,6 +9,7 @@ import numpy as np
 from batched import export
 from common.batch import make_batch
 from common.errors import BadInput
+from common.flying import fly_until_ended
 from common.tasks import Interface, SampledTask
 
 KEPT_FLIGHTS = 30  # in a results folder
@@ -37,22 +38,14 @@ class BatchedTask(SampledTask):
         seen = np.full((n, T + 1, obs.shape[1]), np.nan)
         u = np.full((n, T, envs.single_action_space.shape[0]), np.nan)
         reward = np.zeros((n, T))
-        alive, final = np.ones(n, dtype=bool), {}
         seen[:, 0] = obs
-        for t in range(T):
-            actions = np.asarray(policy(obs, t))
-            u[alive, t] = actions[alive]
-            obs, rewards, terminated, _, info = envs.step(actions)
-            reward[alive, t] = rewards[alive]
-            last = info["final_obs"] if terminated.any() else obs
-            seen[alive, t + 1] = np.where(terminated[:, None], last, obs)[alive]
-            ended = alive & terminated
-            for key, value in info.get("final_info", {}).items():
-                if not key.startswith("_"):
-                    final.setdefault(key, np.zeros_like(value))[ended] = value[ended]
-            alive &= ~terminated
-            if not alive.any():
-                break
+
+        def record(step):
+            u[step.flew, step.t] = step.action[step.flew]
+            seen[step.flew, step.t + 1] = step.next_obs[step.flew]
+            reward[step.flew, step.t] = step.reward[step.flew]
+
+        final = fly_until_ended(envs, policy, obs, record, restart=True)
         metrics = {"env_id": self.env_id, "eval_seed": eval_seed, "eval_starts": n}
         metrics["episodic_return"] = float(reward.sum(axis=1).mean())
         metrics["episodic_length"] = float(np.isfinite(u[..., 0]).sum(axis=1).mean())

@@ -14,8 +14,9 @@ from gymnasium.vector import AutoresetMode
 
 from common.batch import RENDERED, BatchedEnv, SingleEnv, check_options, of_batch, refuse_autoreset
 from common.errors import BadInput, is_finite, refuse_unless
+from common.flying import fly_until_ended
 from landing.dynamics import Arc
-from landing.lander import DRAW, LANDERS, Flights, Lander, check_failure, flights
+from landing.lander import DRAW, LANDERS, Flights, Lander, check_failure, draw_flights
 from landing.rewards import (
     ALOFT_PRICE,
     FUEL_PRICE,
@@ -145,7 +146,7 @@ class LanderVectorEnv(BatchedEnv):
 
     def _drawn(self, draw) -> Flights:
         failure = self.failure_probability, self.failure_size, self.failure_time
-        return flights(self.lander, draw, *failure, self.start_spread)
+        return draw_flights(self.lander, draw, *failure, self.start_spread)
 
     def _observation_space(self):
         """The box that holds every observation."""
@@ -415,24 +416,25 @@ def fly_lander(env_id: str, policy: Callable, draw: np.ndarray, decision_s: floa
     start = state_of(batch)
     gravity = batch.flights.gravity.T.copy()
     u, effectiveness, y = [], [], [start]
-    final_info = {}
-    alive = np.ones(len(draw), dtype=bool)
-    for period in range(batch.episode_steps):
+    command = None
+
+    def held(obs, period):
+        nonlocal command
         if period % hold == 0:
-            action = policy(obs, period // hold)
-        acts = batch.effectiveness().T
-        obs, _, ended, final = batch.advance(action)
-        u.append(np.where(alive[:, None], batch.u, np.nan))
-        effectiveness.append(np.where(alive[:, None], acts, np.nan))
-        y.append(np.where(alive[:, None], state_of(batch), np.nan))
-        for key, value in final.items():
-            final_info.setdefault(key, value.copy())[alive & ended] = value[alive & ended]
-        alive &= ~ended
-        if not alive.any():
-            break
+            command = policy(obs, period // hold)
+        effectiveness.append(batch.effectiveness().T)  # before the period, in which a failure may strike
+        return command
+
+    def record(period):
+        flew = period.flew[:, None]
+        u.append(np.where(flew, batch.u, np.nan))
+        effectiveness[-1] = np.where(flew, effectiveness[-1], np.nan)
+        y.append(np.where(flew, state_of(batch), np.nan))
+
+    final = fly_until_ended(batch, held, obs, record)
     flown = {"u": u, "effectiveness": effectiveness, "y": y}
     flown = {key: np.stack(rows, axis=1) for key, rows in flown.items()}
-    return {**flown, "start": start, "gravity": gravity, **final_info}
+    return {**flown, "start": start, "gravity": gravity, **final}
 
 
 def state_of(batch: LanderVectorEnv) -> np.ndarray:

@@ -115,7 +115,7 @@ class Flights(NamedTuple):
 DRAW = ("x", "y", "z", "vx", "vy", "vz", "mass", "gx", "gy", "gz", "failure", "axis", "moment")
 
 
-def flights(
+def draw_flights(
     lander: Lander, draw: np.ndarray, probability: float, size: float, time: str, start_spread: float = 1.0
 ) -> Flights:
     """The flights of draws (n, 13). `start_spread` widens the box of the starts, but not its heights and sink rates.

@@ -12,6 +12,7 @@ from gymnasium.vector import AutoresetMode
 
 from common.batch import RENDERED, BatchedEnv, SingleEnv, check_options, of_batch, refuse_autoreset
 from common.errors import BadInput, refuse_unless
+from common.flying import fly_until_ended
 from common.integration import falling_root
 from phased.problem import LARGEST_SCORE, PROBLEMS, Phase, Problem
 
@@ -474,24 +475,19 @@ def fly(env_id: str, policy: Callable, x0, draw=None, **options) -> dict:
     x = np.full((n, T + 1, problem.states), np.nan)
     u = np.full((T, *batch.u.shape), np.nan)
     reward = np.zeros((n, T))
-    final_info = {}
-    alive = np.ones(n, dtype=bool)
     options = {"x0": x0}
     if problem.scores:
         options["draw"] = np.zeros((n, problem.scores)) if draw is None else draw
     obs, _ = batch.reset(options=options)
     x[:, 0] = np.column_stack(batch.x)  # not from obs, where the velocity may be hidden
-    for t in range(T):
-        obs, rewards, ended, final = batch.advance(policy(obs, t))
-        x[alive, t + 1] = np.column_stack(batch.x)[alive]
-        u[t, alive] = batch.u[alive]
-        reward[alive, t] = rewards[alive]
-        for key, value in final.items():
-            final_info.setdefault(key, value.copy())[alive & ended] = value[alive & ended]
-        alive &= ~ended
-        if not alive.any():
-            break
-    return {"x": x, "u": np.moveaxis(u, 0, 1), "reward": reward, **final_info}
+
+    def record(step):
+        x[step.flew, step.t + 1] = np.column_stack(batch.x)[step.flew]
+        u[step.t, step.flew] = batch.u[step.flew]
+        reward[step.flew, step.t] = step.reward[step.flew]
+
+    final = fly_until_ended(batch, policy, obs, record)
+    return {"x": x, "u": np.moveaxis(u, 0, 1), "reward": reward, **final}
 
 
 make_phased.metadata = RENDERED  # gym.make looks here before there is an environment

@@ -9,6 +9,7 @@ import numpy as np
 
 from common.command_line import integer, number
 from common.errors import BadInput, refuse_unless
+from common.flying import decision_us
 from common.tasks import Interface
 from formats.track import Track
 from pages.assemble import Page
@@ -22,7 +23,6 @@ from rocket.metrics import (
     EQUATORIAL,
     SUCCESS,
     chosen,
-    decision_us,
     draws,
     evaluate_dispersed,
     failure_metrics,
