@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-import baselines  # noqa: F401 - makes every id known to `task_of`
+import envs  # noqa: F401 - makes every id known to `task_of`
 from common.checkpoints import read_checkpoint, write_bfloat16
 from common.command_line import OneLineParser, integer, longitude, named_path, number, output_file, positive, utc
 from common.curves import evaluated, read_csv, read_curve, write_csv
@@ -31,6 +31,7 @@ from common.evaluations import read_evaluation, read_json, read_metrics, sha256_
 from common.files import read_npz, write_bytes, write_npz
 from common.policies import script_of
 from common.tasks import task_of
+from drawing.evaluation import draw_animation, draw_figures
 from formats.columns import csv_bytes
 from formats.czml import czml_bytes
 from formats.oem import oem_bytes
@@ -172,13 +173,6 @@ def redraw(folder) -> list[Path]:
     return draw_figures(folder, arrays, metrics, [own, *curves.values()] if own else [])
 
 
-def draw_figures(folder, arrays: dict, metrics: dict, curves: list[dict]) -> list[Path]:
-    """Draw the figures of an evaluation and of these training curves into folder/figures. Returns their paths."""
-    from drawing.style import save_figures  # only a drawing should wait the quarter of a second that Matplotlib takes
-
-    return save_figures(Path(folder) / "figures", task_of(metrics["env_id"]).figures(arrays, metrics, curves))
-
-
 def animate(folder) -> Path:
     """Write figures/animation.gif of a results or run folder from its eval.json and eval.npz. Returns its path.
 
@@ -187,13 +181,6 @@ def animate(folder) -> Path:
     folder = Path(folder)
     metrics, arrays = read_evaluation(folder)
     return draw_animation(folder, arrays, metrics)
-
-
-def draw_animation(folder, arrays: dict, metrics: dict) -> Path:
-    """Write the animation of an evaluation, policy beside optimum, into folder/figures. Returns its path."""
-    path = Path(folder) / "figures" / "animation.gif"
-    task_of(metrics["env_id"]).animation(arrays, metrics).write(path)
-    return path
 
 
 def seed_lines(folder) -> list[str]:

@@ -4,15 +4,15 @@ A *family* is a kind of environment. The small problems (`phased/`), the rockets
 (`landing/`) have tables. `batched/` is for all other environments derived from `BatchedEnv`. `evaluate.py`, `runs.py`,
 the command of `baselines.py` and the benchmarks call `task_of(env_id)`. They never ask which family an id is of.
 
-A new family is a folder with a class of this shape, and one line `add_family(TABLES, make_task)` in `envs.py`. The
-small problems' line is in `baselines.py`, which solves them. So their ids are known after `import baselines`, which
-`evaluate.py` does.
+A new family is a folder with a class of this shape, and one line `add_family(TABLES, "module:function")` in `envs.py`.
+So every id is known after `import envs`. A family's module is imported when the task of one of its ids is asked for.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any, NamedTuple, Protocol
 
 from common.errors import BadInput
@@ -199,13 +199,15 @@ class SampledTask(GroundTask):
         return f"--eval-seed {eval_seed} is the training's --seed: it may have flown these starts"
 
 
-# (tables by environment id, function that makes an id's task) of each family
-FAMILIES: list[tuple[Mapping[str, Any], Callable[[str], Task]]] = []
+# (tables by environment id, "module:function" that makes an id's task) of each family
+FAMILIES: list[tuple[Mapping[str, Any], str]] = []
 
 
-def add_family(tables: Mapping[str, Any], make_task: Callable[[str], Task]) -> None:
-    """Make a family's ids known, also those that are added to `tables` later. The same `tables` replace themselves."""
-    FAMILIES[:] = [family for family in FAMILIES if family[0] is not tables]
+def add_family(tables: Mapping[str, Any], make_task: str) -> None:
+    """Make a family's ids known, also those that are added to `tables` later.
+
+    `make_task` names the function that makes an id's task, as "module:function".
+    """
     FAMILIES.append((tables, make_task))
 
 
@@ -236,5 +238,5 @@ def task_of(env_id: str) -> Task:
     """The task of an environment id. Raises BadInput if no family has the id."""
     for tables, make_task in FAMILIES:
         if env_id in tables:
-            return make_task(env_id)
+            return resolve_name(make_task)(env_id)
     raise BadInput(f"env_id is {env_id!r}, of no family (`add_family`); it must be one of {', '.join(env_ids())}")

@@ -298,7 +298,7 @@ def test_plane_below_the_launch_latitude_is_a_warning():
 @pytest.mark.parametrize("env_id", ["DoubleIntegrator-v0", "CartPole-v1", "a/b", "", "my rocket", "DoubleIntegrator"])
 def test_foreign_ids_are_refused(env_id):
     missions, specs = dict(ROCKETS), dict(gym.registry)
-    with pytest.raises(BadInput, match=f"^env_id is {env_id!r}; it must be a new id such as MyRocket-v0"):
+    with pytest.raises(BadInput, match=f"^env_id is {env_id!r}; it must be a new id such as Mine-v0"):
         register_rocket(env_id, TWO)
     assert missions == ROCKETS and specs == gym.registry
 
