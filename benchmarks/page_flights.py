@@ -21,8 +21,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.checkpoints import read_checkpoint  # noqa: E402
 from common.evaluations import read_evaluation  # noqa: E402
 from common.tasks import task_of  # noqa: E402
-from evaluate import LAUNCH_LONGITUDE  # noqa: E402
-from pages.assemble import html_bytes  # noqa: E402
+from exports.folders import LAUNCH_LONGITUDE  # noqa: E402
+from exports.offers import offer  # noqa: E402
+from exports.page import html_bytes  # noqa: E402
 
 NO_CHANGES = {"thrust": 0.0, "drag": 0.0, "windEast": 0.0, "windNorth": 0.0, "payload": 0.0, "failure": None}
 CHANGED = [
@@ -57,7 +58,7 @@ def page_of(folder: Path) -> str:
     """The page of a results or run folder."""
     metrics, arrays = read_evaluation(folder)
     checkpoint = read_checkpoint(folder / "agent.safetensors", {})
-    return html_bytes(task_of(metrics["env_id"]).page(metrics, arrays, checkpoint, LAUNCH_LONGITUDE)).decode()
+    return html_bytes(offer(task_of(metrics["env_id"]), "page")(metrics, arrays, checkpoint, LAUNCH_LONGITUDE)).decode()
 
 
 def print_differences(folder: Path, engine: Engine):

@@ -588,12 +588,8 @@ def test_an_id_that_is_taken_is_refused():
 def test_a_file_that_fails_is_left_out_with_one_line(tmp_path):
     """The others are there: the command of another id still works."""
     for part in (
-        "batched",
         "common",
-        "drawing",
-        "formats",
         "landing",
-        "pages",
         "phased",
         "rocket",
         "vehicles",

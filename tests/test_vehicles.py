@@ -343,7 +343,7 @@ def test_evaluation_does_not_keep_the_optimum_of_a_replaced_rocket(monkeypatch):
 
 def test_a_bad_file_of_vehicles_is_left_out_with_a_line(tmp_path):
     shutil.copy(ROOT / "envs.py", tmp_path)
-    for room in ("batched", "common", "formats", "landing", "pages", "phased", "rocket"):
+    for room in ("common", "landing", "phased", "rocket"):
         shutil.copytree(ROOT / room, tmp_path / room)
     (tmp_path / "vehicles").mkdir()
     good = (ROOT / "vehicles" / "two_stage_leo.py").read_text()
