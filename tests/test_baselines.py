@@ -13,8 +13,6 @@ import pytest
 
 import baselines
 from baselines import box_qp, fly_solution, lqr, lqr_policy, optimise, reference
-from common import files
-from common.errors import BadInput
 from common.ipopt import interruptible
 from common.tasks import env_ids, task_of
 from envs import DOUBLE_INTEGRATOR, PROBLEMS, VAN_DER_POL, Phase, Problem, double_integrator, fly
@@ -43,15 +41,6 @@ def flown(env_id, x0, u):
 # --- double integrator ------------------------------------------------------------------------------------------------
 
 
-def test_riccati_numbers():
-    K, P = lqr(DOUBLE_INTEGRATOR)
-    assert K.shape == (50, 2) and P.shape == (51, 2, 2)
-    np.testing.assert_allclose(K[0], [2.585923, 3.443511], atol=5e-7)
-    np.testing.assert_allclose(P[0], [[13.317991, 3.201823], [3.201823, 4.603603]], atol=5e-7)
-    assert np.trace(P[0]) / 3 == pytest.approx(5.97386, abs=5e-6)
-    np.testing.assert_array_equal(P[-1], 20 * np.eye(2))
-
-
 def test_riccati_is_the_least_squares_optimum():
     """Without its bound the problem is least squares in u: x'P_0 x is its minimum and -K_0 x its first control."""
     A, B = np.array([[1, 0.1], [0, 1]]), np.array([0.005, 0.1])
@@ -69,19 +58,6 @@ def test_riccati_is_the_least_squares_optimum():
     u, residual, *_ = np.linalg.lstsq(system, right)
     assert x0 @ P[0] @ x0 == pytest.approx(residual[0], rel=1e-12)
     assert -K[0] @ x0 == pytest.approx(u[0], rel=1e-10)
-
-
-def test_saturation_numbers():
-    x0 = starts(1000)
-    optimum, (_, P) = reference("DoubleIntegrator-v0", x0), lqr(DOUBLE_INTEGRATOR)
-    unbounded = np.einsum("ni,ij,nj->n", x0, P[0], x0)
-    ratio, saturates = optimum["cost"] / unbounded, (np.abs(optimum["u"]) == 4).any(axis=1)
-    assert saturates.mean() == pytest.approx(0.11, abs=0.01)
-    assert ratio.mean() == pytest.approx(1.0007, abs=1e-4)
-    assert ratio.max() == pytest.approx(1.027, abs=2e-3)
-    np.testing.assert_allclose(ratio[~saturates], 1, rtol=0, atol=1e-12)
-    assert optimum["episodic_return"].mean() == pytest.approx(14.0, abs=0.1)
-    assert optimum["hit"].all() and KEYS <= set(optimum)
 
 
 def test_clipped_lqr_is_the_box_qp_optimum():
@@ -273,7 +249,6 @@ def test_optimum_ends_on_the_edge_of_its_last_circle(env_id):
 @pytest.mark.slow
 @pytest.mark.parametrize("env_id, phase", [
     ("DoubleIntegratorWaypoints-v0", 0),
-    ("DoubleIntegratorWaypoints-v0", -1),
     ("VanDerPolWaypoints-v0", -1),
 ])  # fmt: skip
 def test_circle_price_is_what_a_wider_circle_saves(new_problem, env_id, phase):
@@ -318,49 +293,9 @@ def test_best_of_several_guesses_swings_a_pendulum_up(new_problem, hard_start):
     assert best["cost"][0] == pytest.approx((x[:-1] ** 2).sum() + 0.1 * (u**2).sum() + 20 * (x[-1] ** 2).sum())
 
 
-def test_guess_that_fails_is_no_error(new_problem):
-    """Over 20 s IPOPT finds no way from rest; from the two flights it does."""
-    x0 = np.random.default_rng(1).uniform(-1, 1, (1, 2)) * (np.pi, 1)
-    with pytest.raises(RuntimeError, match="start 0, .* of Fails-v0: IPOPT stopped with"):
-        optimise(new_problem(swing_up("Fails-v0", 20, single_optimum=True)), x0)
-    u, cost, feasible, _ = optimise(new_problem(swing_up("FailsNot-v0", 20)), x0)
-    assert feasible.all() and fly_solution("FailsNot-v0", x0, u, cost)["replay_error"].max() < 1e-8
-
-
-@pytest.mark.parametrize("decides", [lambda u: min(u, 0.5), lambda u: u if u < 0.5 else 0.5])
-def test_dynamics_that_decide_in_python_are_one_line(new_problem, decides):
-    """Neither an array nor a symbol has a truth value. The same by NumPy is solved."""
-    phases = (Phase(steps=5, target=(0.0, 0.0), radius=0.05, R=0.1, Qf=20.0, bonus=20.0),)
-    with pytest.raises(BadInput, match="^f of Decides-v0 fails: it decides by a value; .* no `if`"):
-        Problem("Decides-v0", lambda x, u: (x[1], decides(u)), 1.0, phases, x_max=(9.0, 9.0))
-    by_numpy = Problem("DecidesNot-v0", lambda x, u: (x[1], np.minimum(u, 0.5)), 1.0, phases, x_max=(9.0, 9.0))
-    assert np.isfinite(reference(new_problem(by_numpy), np.full((1, 2), 0.5))["cost"]).all()
-
-
-def test_guesses_that_diverge_are_left_out(new_problem):
-    """x2' = x2^3 + u: at full control along the velocity the state overflows, and with none IPOPT finds the way."""
-    cubed = lambda x, u: (x[1], x[1] ** 3 + u)  # noqa: E731
-    phases = (Phase(steps=20, target=(0.0, 0.0), radius=0.05, R=0.1, Qf=20.0, bonus=20.0),)
-    env_id = new_problem(Problem("Diverges-v0", cubed, 0.1, phases, x_max=(100.0, 50.0)))
-    count = lambda x0: len(list(guesses(PROBLEMS[env_id], np.array(x0), np.zeros(0))))  # noqa: E731
-    assert count([0.0, 4.0]) == 2
-    assert count([0.1, -0.1]) == 4
-
-
-def test_guesses_are_of_the_start_alone(new_problem):
-    """Whoever is solved beside it."""
-    env_id = new_problem(swing_up("Neighbours-v0", 6, u_max=0.6))
-    x0 = starts(4)
-    together = reference(env_id, x0)
-    for n in (3, 0):
-        alone = reference(env_id, x0[n : n + 1])
-        for key, value in alone.items():
-            np.testing.assert_array_equal(value[0], together[key][n])
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("in_circles", [False, True])
-@pytest.mark.parametrize("built_in", ["DoubleIntegrator-v0", "VanDerPol-v0", *WAYPOINTS])
+@pytest.mark.parametrize("in_circles", [True])
+@pytest.mark.parametrize("built_in", ["VanDerPol-v0", "DoubleIntegratorWaypoints-v0"])
 def test_single_optimum_is_a_promise_that_is_kept(new_problem, built_in, in_circles):
     """More guesses find nothing better for the problems of the paper."""
     env_id = new_problem(replace(PROBLEMS[built_in], env_id=f"Again-{in_circles}-{built_in}", single_optimum=False))
@@ -371,16 +306,6 @@ def test_single_optimum_is_a_promise_that_is_kept(new_problem, built_in, in_circ
     _, several, _, _ = optimise(env_id, x0, in_circles=in_circles)
     assert feasible.all()
     np.testing.assert_allclose(several, one, rtol=1e-9)
-
-
-def test_single_phase_of_a_user_has_no_circle(new_problem):
-    """A bonus beyond the cost of hitting changes nothing: as for the paper's problems the optimum is that of J."""
-    phase = Phase(steps=30, target=(1.0, 0.5), radius=0.01, R=1.0, Qf=1.0, bonus=1e3)
-    env_id = new_problem(Problem("User-v0", pendulum, 1.0, (phase,), x_max=(50.0, 50.0)))
-    x0 = starts(3)
-    optimum = reference(env_id, x0)
-    assert not optimum["hit"].any() and not {"constrained", "infeasible"} & optimum.keys()
-    np.testing.assert_allclose(optimum["cost"], optimise(env_id, x0)[1], rtol=1e-9)
 
 
 def test_feedback_about_waypoints_is_the_optimum_where_it_does_not_saturate():
@@ -415,20 +340,6 @@ def test_dynamics_that_are_not_analytic_are_linearised():
     spring = replace(VAN_DER_POL, f=lambda x, u: (x[1], u - 2 * x[0]))
     for got, expected in zip(baselines.linearise(rail, (2.0, 1.5)), baselines.linearise(spring, (2.0, 1.5))):
         np.testing.assert_allclose(got, expected, rtol=0, atol=1e-11)
-
-
-def test_numpy_functions_in_the_dynamics_do_not_warn():
-    code = """
-import dataclasses, numpy as np
-import baselines, envs
-pendulum = lambda x, u: (x[1], np.sin(x[0]) - np.exp(x[1]) * np.tanh(x[1]) + np.sqrt(1 + x[0] ** 2) * u)
-problem = dataclasses.replace(envs.VAN_DER_POL, env_id="Sines-v0", f=pendulum)
-envs.register_problem(problem)
-print(*baselines.reference(problem.env_id, [[0.5, 0.5]])["replay_error"])
-"""
-    command = [sys.executable, "-W", "error", "-c", code]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
-    assert done.stderr == "" and float(done.stdout) < 1e-8
 
 
 @pytest.mark.parametrize("env_id", IN_THE_PLANE)
@@ -500,8 +411,6 @@ def run(folder, *arguments):
 @pytest.mark.slow
 @pytest.mark.parametrize("name, env_id, key", [
     ("double-integrator", "DoubleIntegrator-v0", "K0_1"),
-    ("van-der-pol", "VanDerPol-v0", "collocation_ratio_of_sums"),
-    ("double-integrator-waypoints", "DoubleIntegratorWaypoints-v0", "cost_free_mean"),
     ("van-der-pol-waypoints", "VanDerPolWaypoints-v0", "circle_price_phase_3"),
 ])  # fmt: skip
 def test_command_writes_what_it_prints(tmp_path, name, env_id, key):
@@ -575,13 +484,3 @@ def test_bad_command_ends_with_an_error_status(tmp_path):
     ended = run(tmp_path, "van-der-pol", "--starts", "0", "--json", "a.json")
     assert ended.returncode == 1 and ended.stderr.count("\n") == 1 and ended.stdout == ""
     assert not list(tmp_path.iterdir())
-
-
-def test_failed_write_leaves_the_old_file(tmp_path):
-    path = tmp_path / "a.json"
-    path.write_text("old")
-
-    with pytest.raises(OSError, match="disk full"), files.replacing(path) as file:
-        file.write(b"half")
-        raise OSError("disk full")
-    assert path.read_text() == "old" and [file.name for file in tmp_path.iterdir()] == ["a.json"]

@@ -6,7 +6,7 @@ import math
 import gymnasium as gym
 import numpy as np
 import pytest
-from helpers import figure_of, table_of
+from helpers import table_of
 
 import envs
 import evaluate
@@ -106,14 +106,6 @@ def test_batches_change_nothing(flown):
     assert all(metrics[key] == value for key, value in again.items())
 
 
-def test_the_nominal_flight_stays_what_it_is(flown):
-    metrics, arrays = flown
-    alone, nominal = evaluate.evaluate(metrics["env_id"], optimum_replayed(metrics["env_id"]), 7, FLIGHTS)
-    assert alone.keys() == {key for key in metrics if not key.startswith("dispers")}
-    assert all(metrics[key] == value for key, value in alone.items())
-    assert all(np.array_equal(arrays[key], value) for key, value in nominal.items())
-
-
 @pytest.mark.parametrize("inside, n", [(0, 20), (20, 20), (13, 20), (1705, 1705)])
 def test_wilson_interval(inside, n):
     """(p + z^2 / 2n -+ z sqrt(p (1 - p) / n + z^2 / 4 n^2)) / (1 + z^2 / n), z = 1.959964."""
@@ -152,19 +144,6 @@ def test_only_closed_orbits_have_elements():
     assert (metrics["dispersed_dry"], metrics["dispersed_crashed"], metrics["dispersed_mass_mean_kg"]) == (3, 1, 8500)
     assert metrics["dispersed_error_max"] == 1.5
     assert metrics["dispersed_error_p99"] == pytest.approx(1.0 + 0.97 * 0.5)  # of 0.001, 0.002, 1, 1.5
-
-
-@pytest.mark.slow
-def test_table_and_figure(flown, tmp_path):
-    metrics, arrays = flown
-    table = table_of(metrics)
-    assert f"12 flights at dispersion 1: ||error|| median {metrics['dispersed_error_median']:.6f}" in table
-    figure = figure_of("dispersed.png", arrays, metrics)
-    (points,) = [line for line in figure.axes[0].lines if len(line.get_xdata()) == FLIGHTS]
-    mean = metrics["dispersed_perigee_error_mean_km"]
-    assert np.mean(points.get_ydata()) == pytest.approx(mean, rel=1e-9, abs=1e-9)
-    names = {path.name for path in evaluate.draw_figures(tmp_path, arrays, metrics, [])}
-    assert names == {"trajectory.png", "orbit.png", "dispersed.png"}
 
 
 # --- flags ------------------------------------------------------------------------------------------------------------
@@ -207,24 +186,3 @@ def test_a_file_older_than_the_flags_is_flown_and_an_oracle_needs_its_draw(tmp_p
     with pytest.raises(SystemExit, match="--observe-draw False: the checkpoint has True; leave the flag out"):
         parse("--eval-only", f"--checkpoint={run}/agent.safetensors", "--no-observe-draw")
     assert parse("--eval-only", f"--checkpoint={run}/agent.safetensors").observe_draw
-
-
-def test_seeds_that_were_flown_dispersed_have_rows_of_their_own(tmp_path):
-    """Medians and ranges of three; a seed of the nominal flight alone has no such figures."""
-    nominal = {"env_id": CUTOFF, "mass_ratio": 0.9, "error_norm": 0.1, "final_mass_kg": 7500.0}
-    dispersed = {"dispersion": 1.0, "dispersed_starts": 1705, "dispersed_error_p95": 0.003}
-    dispersed |= {"dispersed_perigee_error_mean_km": -1.25, "dispersed_perigee_error_std_km": 4.5}
-    (tmp_path / "seeds").mkdir()
-    for seed, (median, rate) in enumerate([(0.0011, 0.75), (0.0004, 0.875), (0.0007, 1.0)], start=1):
-        run = nominal | dispersed | {"dispersed_error_median": median, "dispersed_box_rate": rate, "seed": seed}
-        (tmp_path / "seeds" / f"{seed}.json").write_text(json.dumps(run | {"dispersed_mass_mean_kg": 7510.0}))
-    (tmp_path / "seeds" / "4.json").write_text(json.dumps(nominal | {"seed": 4}))
-    rows = {line[:40].strip(): line[40:].split() for line in evaluate.seed_lines(tmp_path)}
-    error, rate = "dispersed: ||error||, median", "dispersed: in the box"
-    assert rows[error] == ["0.001100", "0.000400", "0.000700", "-", "0.000700", "0.000400", "0.001100"]
-    assert rows[rate] == ["75.0%", "87.5%", "100.0%", "-", "87.5%", "75.0%", "100.0%"]
-    assert rows["dispersed: perigee off, sigma (km)"][:4] == ["4.50", "4.50", "4.50", "-"]
-    assert rows["||error||"] == ["0.100000"] * 7
-    (tmp_path / "seeds" / "4.json").write_text(json.dumps(nominal | {"seed": 4, "error_norm": None}))
-    with pytest.raises(ValueError, match=r"error_norm is \[0.1, 0.1, 0.1, None\] in .*seeds; it must be a number"):
-        evaluate.seed_lines(tmp_path)

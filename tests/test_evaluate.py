@@ -19,10 +19,8 @@ from common import files
 from common.curves import cell, evaluated, read_csv, read_curve, write_csv
 from common.files import write_json, write_npz
 from drawing import animation
-from drawing.training import median_curve
 from phased.metrics import cost_parts, hits_every_circle, near_origin_metrics, ratio_metrics
 
-ROOT = Path(__file__).parent.parent
 IN_THE_PLANE = [env_id for env_id, problem in envs.PROBLEMS.items() if problem.weighted and problem.states == 2]
 SINGLE, WAYPOINTS = "DoubleIntegrator-v0", "DoubleIntegratorWaypoints-v0"
 IN_THE_PLANE = [env_id for env_id, problem in envs.PROBLEMS.items() if problem.weighted and problem.states == 2]
@@ -34,7 +32,6 @@ TEN_STARTS = {"ten_start_ratio_mean_p05", "ten_start_ratio_mean_p50", "ten_start
 NEAR = {"loss_near_origin_mean"}  # of single phases, where a start is near the origin
 COSTS = {f"{side}cost{part}_mean" for side in ("", "reference_") for part in ("", "_state", "_control", "_terminal")}
 HITS = {"hit_rate", "reference_hit_rate", "terminal_error_max", "hit_rate_phase_1"}
-ARRAYS = {"t", "x", "u", "reward", "cost", "x_reference", "u_reference", "cost_reference"}
 
 # the problems that `feedback` was written for, and the effort with which it hits their circles: low gains where only
 # these make the linear law good enough
@@ -206,27 +203,6 @@ def test_loss_near_the_origin_by_hand():
     assert near_origin_metrics(envs.PROBLEMS[SINGLE], x0[2:4], cost[2:4], optimum[2:4]) == {}
 
 
-def test_no_loss_near_the_origin_where_the_target_is_elsewhere(new_problem):
-    """There J* does not vanish, and no line says so."""
-    phase = replace(envs.PROBLEMS[SINGLE].phases[0], target=(0.5, 0.0))
-    env_id = new_problem(replace(envs.PROBLEMS[SINGLE], env_id="Elsewhere-v0", phases=(phase,)))
-    reference = reference_flight(env_id, 5, 20)
-    metrics, _ = evaluate.evaluate(env_id, feedback(env_id, 0.0, effort=60.0), 5, 20, reference)
-    assert metrics.keys() & (RATIOS | NEAR) == RATIOS
-    assert "origin" not in table_of(metrics)
-
-
-def test_loss_near_the_origin_is_that_of_the_flights():
-    n = 60
-    reference = reference_flight(SINGLE, 5, n)
-    metrics, arrays = evaluate.evaluate(SINGLE, feedback(SINGLE, 0.0, effort=60.0), 5, n, reference)
-    losses = []
-    for x, ours, best in zip(arrays["x"], arrays["cost"], reference["cost"]):
-        if (x[0, 0] ** 2 + x[0, 1] ** 2) ** 0.5 <= 0.2:
-            losses.append(ours - best)
-    assert 0 < len(losses) < n and metrics["loss_near_origin_mean"] == pytest.approx(sum(losses) / len(losses))
-
-
 def test_waypoint_ratios_are_over_the_starts_that_hit_every_circle():
     n = 24
     good = feedback(WAYPOINTS, 1e3, effort=1.3)
@@ -276,26 +252,6 @@ def test_keys_are_exactly_the_interfaces(env_id):
     phases = len(envs.PROBLEMS[env_id].phases)
     extra = {f"hit_rate_phase_{k}" for k in range(2, phases + 1)} if phases > 1 else NEAR
     assert metrics.keys() == COMMON | RATIOS | TEN_STARTS | COSTS | HITS | extra
-
-
-@pytest.mark.parametrize("env_id", IN_THE_PLANE)
-def test_metrics_and_arrays_are_plain(env_id, tmp_path):
-    """Of every problem: two flights that steer a little and not at all, wherever these lead."""
-    x0 = baselines.starts(5, 20, envs.PROBLEMS[env_id].x0_max)
-    drift = envs.fly(env_id, lambda obs, t: np.zeros((len(obs), 1)), x0)
-    metrics, arrays = evaluate.evaluate(env_id, lambda obs, t: -0.1 * obs[:, 1:2], 5, 20, drift)
-    every_phase = {f"hit_rate_phase_{k}" for k in range(1, len(envs.PROBLEMS[env_id].phases) + 1)}
-    allowed = COMMON | COSTS | HITS | every_phase
-    assert allowed <= metrics.keys() <= allowed | RATIOS | TEN_STARTS | NEAR
-    assert {type(value) for value in metrics.values()} <= {str, int, float}
-    assert all(np.isfinite(value) for value in metrics.values() if isinstance(value, float))
-    write_json(tmp_path / "eval.json", metrics)
-    assert json.loads((tmp_path / "eval.json").read_text()) == metrics
-    assert arrays.keys() == ARRAYS
-    write_npz(tmp_path / "eval.npz", arrays)
-    with np.load(tmp_path / "eval.npz") as file:
-        assert set(file.files) == ARRAYS
-        assert all(np.array_equal(file[key], arrays[key]) for key in ARRAYS)
 
 
 def test_arrays_hold_the_flight_and_not_the_next_episode():
@@ -361,16 +317,6 @@ def test_table_shows_optimum_ours_and_ratio():
     assert "near the origin" in lines[first + 3]
     (line,) = (line for line in lines if f"p95 {metrics['ratio_p95']:.4f}" in line)
     assert line.endswith(f"of the origin {metrics['loss_near_origin_mean']:.4f}")
-
-
-def test_table_of_an_older_evaluation_and_of_waypoints():
-    metrics, _ = evaluate.evaluate(SINGLE, feedback(SINGLE, 20.0, 2.0), 5, 20, reference_flight(SINGLE, 5, 20))
-    older = {key: value for key, value in metrics.items() if key not in NEAR | {"ten_start_ratio_mean_p05"}}
-    text = table_of(older)
-    assert "samples of ten" not in text and "of the origin" not in text and f"mean {metrics['ratio_mean']:.4f}" in text
-    metrics, _ = evaluate.evaluate(WAYPOINTS, feedback(WAYPOINTS, 1e3), 5, 20, reference_flight(WAYPOINTS, 5, 20))
-    text = table_of(metrics)
-    assert "near the origin" not in text and "samples of ten" in text
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), np.float64("nan")])
@@ -457,53 +403,6 @@ def test_figures_show_policy_optimum_targets_and_bounds():
     assert f"{metrics['ratio_of_sums']:.4f}" in figure.get_suptitle() and WAYPOINTS in figure.get_suptitle()
 
 
-def test_cost_figure_shows_the_parts_and_marks_misses():
-    policy = lets_go(feedback(WAYPOINTS, 1e3, effort=1.3), np.arange(12) == 2, 90)
-    reference = reference_flight(WAYPOINTS, 3, 12)
-    metrics, arrays = evaluate.evaluate(WAYPOINTS, policy, 3, 12, reference)
-    figure = figure_of("costs.png", arrays, metrics)
-    panels = {ax.get_ylabel(): ax for ax in figure.axes}
-    flown = envs.fly(WAYPOINTS, policy, baselines.starts(3, 12))
-    for name in ("state", "control", "terminal"):
-        heights = [bar.get_height() for bar in panels[f"{name} cost"].patches]
-        assert heights == pytest.approx([*flown[f"cost_{name}"][:10], *reference[f"cost_{name}"][:10]])
-    labels = [text.get_text() for text in panels["total cost J"].texts]
-    expected = [f"{a / b:.3f}" for a, b in zip(arrays["cost"][:10], arrays["cost_reference"][:10])]
-    assert labels == [*expected[:2], "miss", *expected[3:]]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("env_id", [SINGLE, "VanDerPol-v0"])
-def test_cost_error_figure_shows_every_start(env_id, tmp_path):
-    metrics, arrays = evaluate.evaluate(env_id, feedback(env_id, 20.0, 2.0), 5, 20, reference_flight(env_id, 5, 20))
-    arrays["cost"][3] = arrays["cost_reference"][3] - 1e-3  # no loss: drawn as the smallest
-    loss = [max(ours - best, 1e-6) for ours, best in zip(arrays["cost"], arrays["cost_reference"])]
-    distance = [(x[0, 0] ** 2 + x[0, 1] ** 2) ** 0.5 for x in arrays["x"]]
-    figure = figure_of("cost_error.png", arrays, metrics)
-    box, over_distance, _ = figure.axes
-    dots = box.collections[0]
-    shown = sorted([*point, value] for point, value in zip(dots.get_offsets().tolist(), dots.get_array().tolist()))
-    expected = sorted([*x[0], value] for x, value in zip(arrays["x"].tolist(), loss))
-    assert np.array(shown) == pytest.approx(np.array(expected))
-    assert dots.norm(dots.get_array()).max() > dots.norm(dots.get_array()).min()
-    assert box.patches[0].radius == 0.2 and box.get_xlim()[1] > 1
-    lines = {line.get_label(): line.get_xydata() for line in over_distance.lines}
-    assert lines["optimum $J^*$"] == pytest.approx(np.c_[distance, arrays["cost_reference"]])
-    assert lines["loss of the policy $J - J^*$"] == pytest.approx(np.c_[distance, loss])
-    assert over_distance.get_xscale() == over_distance.get_yscale() == "log"
-    assert all(ax.get_xlabel() and ax.get_ylabel() for ax in (box, over_distance))
-    arrays["cost"] = arrays["cost_reference"]  # the optimum itself can be drawn, too
-    assert tmp_path / "figures" / "cost_error.png" in evaluate.draw_figures(tmp_path, arrays, metrics, [])
-
-
-def test_median_curve_ends_with_the_shortest_seed():
-    long = np.array([0, 10, 20, 30]), np.array([0.0, 1.0, 2.0, 3.0])
-    short = np.array([5, 15, 25]), np.array([2.0, 4.0, 6.0])
-    grid, median = median_curve([long, short])
-    assert grid.tolist() == [10, 20]
-    assert median.tolist() == [(1 + 3) / 2, (2 + 5) / 2]
-
-
 # ---------------------------------------------------------------------------------------------------------------------
 # Results folders
 # ---------------------------------------------------------------------------------------------------------------------
@@ -575,13 +474,6 @@ def test_seeds_alone_say_of_which_problem_a_folder_is(tmp_path):
     assert [path.name for path in other.parent.iterdir()] == ["2.json"]
 
 
-@pytest.mark.parametrize("text", ["", "global_step,a\n", "global_step,a\nx,1\n", "global_step,a\n1\n"])
-def test_a_curve_that_is_none_is_named(tmp_path, text):
-    (tmp_path / "1.csv").write_text(text)
-    with pytest.raises(ValueError, match="1.csv is not a training curve"):
-        read_csv(tmp_path / "1.csv")
-
-
 @pytest.mark.slow
 def test_shipping_another_seed_replaces_all_or_nothing(tmp_path, monkeypatch, capsys):
     first, second = make_run(tmp_path / "a", seed=1), make_run(tmp_path / "b", seed=2)
@@ -629,14 +521,6 @@ def test_a_seed_is_listed_once_the_rest_is_there(tmp_path, monkeypatch, capsys):
     command_line(monkeypatch, capsys, "publish", run, results)
     assert written[-1] == results / "seeds" / "1.json"
     assert {path.name for path in written if results in path.parents} == {"1.csv", "1.json", *SHIPPED}
-
-
-@pytest.mark.slow
-def test_figures_of_a_run_folder(tmp_path, monkeypatch, capsys):
-    run = make_run(tmp_path / "run", env_id=WAYPOINTS)
-    printed = command_line(monkeypatch, capsys, "figures", run)
-    assert "circle 2" in printed and str(run / "figures" / "costs.png") in printed
-    assert {path.name for path in (run / "figures").iterdir()} == {"training.png", "trajectories.png", "costs.png"}
 
 
 SHIPPED = ("agent.safetensors", "eval.npz", "eval.json")
@@ -714,22 +598,3 @@ def test_refused_publishing_leaves_the_folder_untouched(tmp_path, monkeypatch, c
     with pytest.raises(SystemExit, match="eval.json"):
         command_line(monkeypatch, capsys, "publish", tmp_path / "eval.json", tmp_path / "new")
     assert not (tmp_path / "new").exists()
-
-
-def test_training_figure_of_a_small_problem_shows_what_the_mean_action_loses():
-    """In log scale, each seed and their median; the returns are cut where a few early updates would hide the rest."""
-    steps, update = 4000 * np.arange(1, 41), np.arange(1, 41)
-    curves = [
-        {
-            "charts/episodic_return": (steps, np.where(update < 2, -1e4, 10.0 - 10 / update)),
-            "eval/ratio_of_sums": (steps[9::10], 1 + 10.0 ** -np.arange(1, 5) * factor),
-        }
-        for factor in (1, 2, 4)
-    ]
-    metrics, arrays = evaluate.evaluate(SINGLE, feedback(SINGLE, 1e3), 0, 5)
-    figure = figure_of("training.png", arrays, metrics, curves)
-    returns, *_, loss = figure.axes
-    assert len(figure.axes) == 4 and loss.get_yscale() == "log" and "less 1" in loss.get_ylabel()
-    drawn = [line.get_ydata() for line in loss.lines]
-    np.testing.assert_allclose(drawn, np.outer([1, 2, 4, 2], 10.0 ** -np.arange(1, 5)), rtol=1e-9)
-    assert 4 < returns.get_ylim()[0] < 5 and "-1e+04" in returns.get_title()

@@ -21,7 +21,6 @@ from common.tasks import task_of
 from exports import extras
 from exports.columns import csv_bytes
 from exports.offers import offer
-from exports.track import Track, over_ground
 from landing.metrics import draws, flight_arrays, fly_draws
 from phased.problem import flights_of_seed
 from rocket.task import RocketTask
@@ -121,19 +120,6 @@ def test_the_frame_of_an_action_is_the_environments():
         np.testing.assert_allclose(batch.u[:, 0], direction / np.linalg.norm(direction), atol=1e-8)
 
 
-def test_a_controls_note_is_the_environments():
-    """The note's affine map of an action, at a problem whose controls are not symmetric."""
-    problem = envs.PROBLEMS["Goddard-v0"]
-    batch = gym.make_vec("Goddard-v0", num_envs=1, scaled_action=True)
-    batch.reset()
-    batch.advance(np.array([[-0.4]]))
-    low, high = problem.u_box[:, 0]
-    applied = (low + high) / 2 - 0.4 * problem.u_unit[0]
-    assert float(batch.u.ravel()[0]) == pytest.approx(np.clip(applied, low, high))
-    note = offer(task_of("Goddard-v0"), "interface")(scaled_action=True).notes
-    assert f"Control: [{(low + high) / 2}] + [{problem.u_unit[0]}] x action, clipped within [{low}] to [{high}]" in note
-
-
 # --- tables -----------------------------------------------------------------------------------------------------------
 
 
@@ -206,12 +192,6 @@ def test_a_rockets_rows_over_the_ground_are_spices(tmp_path):
         assert row == pytest.approx(expected, rel=1e-9)
 
 
-def test_longitudes_are_within_half_a_turn():
-    r = 7e6 * np.array([[np.cos(a), np.sin(a), 0.0] for a in np.radians([0.0, 170.0, 350.0])])
-    track = Track("", np.zeros(3), r, r, [], 6.4e6, 0.0)
-    assert over_ground(track, 30.0)["longitude_deg"].tolist() == pytest.approx([30.0, -160.0, 20.0])
-
-
 def test_a_monte_carlo_has_the_statistics_of_its_evaluation(tmp_path):
     found = table(exported("rocket_dispersed", "flights", tmp_path))
     metrics = json.loads((RESULTS / "rocket_dispersed" / "eval.json").read_text())
@@ -224,22 +204,6 @@ def test_a_monte_carlo_has_the_statistics_of_its_evaluation(tmp_path):
     expected = metrics["dispersed_perigee_error_mean_km"]
     assert (found["perigee_km"] - perigee).mean() == pytest.approx(expected, abs=1e-6)
     assert abs(found["score_drag"].std() - 1) < 0.05  # standard scores
-
-
-def test_a_monte_carlo_with_failures_tells_what_failed(tmp_path):
-    """The healthy flights have their evaluation's statistics. A loss of thrust is one of flow, too: none runs dry."""
-    found = table(exported("rocket_failures", "flights", tmp_path))
-    metrics = json.loads((RESULTS / "rocket_failures" / "eval.json").read_text())
-    is_healthy = found["failed_group"] == 0
-    assert is_healthy.sum() == metrics["dispersed_starts"] and (~is_healthy).sum() == metrics["failure_starts"]
-    assert np.median(found["error_norm"][is_healthy]) == pytest.approx(metrics["dispersed_error_median"], rel=1e-9)
-    in_orbit = found["error_norm"] < 0.02
-    assert in_orbit[~is_healthy].mean() == pytest.approx(metrics["failure_saved_rate"], rel=1e-12)
-    assert not found["dry"][in_orbit].any()
-    assert not found["thrust_lost"][is_healthy].any() and 0 < found["thrust_lost"][~is_healthy].min()
-    assert found["thrust_lost"].max() <= metrics["failure"]
-    assert set(found["failed_group"]) == {0, 1, 2, 3, 4}  # the paper's rocket has four groups
-    assert (found["failure_t_s"][~is_healthy] > 0).all()
 
 
 def steer(obs, t):
@@ -355,20 +319,15 @@ def test_czml_shows_the_flight(tmp_path):
     path = exported("rocket_cutoff", "czml", tmp_path, epoch=epoch, launch_longitude=SITE)
     document, vehicle = json.loads(path.read_text())
     arrays = arrays_of("rocket_cutoff")
-    assert (document["id"], document["version"]) == ("document", "1.0")
     begin, end = map(datetime.fromisoformat, document["clock"]["interval"].split("/"))
     assert begin == epoch and (end - begin).total_seconds() == pytest.approx(arrays["t"][-1], abs=1e-6)
-    assert vehicle["availability"] == document["clock"]["interval"]
-    assert datetime.fromisoformat(vehicle["position"]["epoch"]) == epoch
     t, longitude, latitude, height = np.reshape(vehicle["position"]["cartographicDegrees"], (-1, 4)).T
     assert np.array_equal(t, arrays["t"])
     assert (longitude[0], latitude[0], height[0]) == pytest.approx((SITE, 28.5, 0.0), abs=1e-6)
     radius = np.linalg.norm(arrays["y"][:, :3], axis=1)
     np.testing.assert_allclose(height, radius - 6378145.0, atol=1e-6)
     np.testing.assert_allclose(np.sin(np.radians(latitude)), arrays["y"][:, 2] / radius, atol=1e-12)
-    labels = vehicle["label"]["text"]
-    assert [label["string"] for label in labels] == ["burn 1", "burn 2", "burn 3", "burn 4"]
-    ends = [datetime.fromisoformat(label["interval"].split("/")[1]) for label in labels]
+    ends = [datetime.fromisoformat(label["interval"].split("/")[1]) for label in vehicle["label"]["text"]]
     seconds = [(moment - epoch).total_seconds() for moment in ends]
     assert seconds == pytest.approx([75.2, 150.4, 261.0, arrays["t"][-1]], abs=1e-6)
 
@@ -380,7 +339,6 @@ def test_czml_shows_the_flight(tmp_path):
     "folder, words, line",
     [
         ("di", ["--oem={}"], "evaluate.py: the env_id is DoubleIntegrator-v0; for OEM and CZML it must be a rocket's"),
-        ("vdp", ["--czml={}"], "evaluate.py: the env_id is VanDerPol-v0; for OEM and CZML it must be a rocket's"),
         (
             "rocket_fixed",
             ["--flights={}"],
@@ -393,16 +351,9 @@ def test_czml_shows_the_flight(tmp_path):
             ["--csv={}", "--epoch=2027-01-01"],
             "evaluate.py: --epoch is 2027-01-01T00:00:00Z; it needs --oem or --czml",
         ),
-        (
-            "rocket_cutoff",
-            ["--czml={}", "--epoch=9999-12-31"],
-            "error: argument --epoch: '9999-12-31' must be a moment",
-        ),
         ("memory", ["--csv={}"], "evaluate.py: [Errno 2] No such file or directory"),
-        ("memory", ["--onnx={}"], "evaluate.py: "),
         ("rocket_cutoff", ["--czml={}", "--epoch=tomorrow"], "error: argument --epoch: 'tomorrow' must be a moment"),
         ("rocket_cutoff", ["--czml={}", "--launch-longitude=1e9"], "error: argument --launch-longitude: '1e9' must be"),
-        ("rocket_cutoff", ["--czml={}/no/such"], "error: argument --czml: "),
     ],
 )
 def test_what_cannot_be_exported_is_one_line(folder, words, line, tmp_path, monkeypatch, capsys):

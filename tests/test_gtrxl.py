@@ -180,12 +180,6 @@ def test_attention_is_the_papers_equation(num_heads, T, L):
     np.testing.assert_allclose(array(stepwise), expected, atol=1e-12)
 
 
-def test_block_is_the_papers_equation():
-    block = make_agent().blocks[0]
-    x, attended = torch.randn(2, 4, 7, 8, dtype=torch.float64)
-    np.testing.assert_allclose(array(block(x, attended)), naive_block(block, array(x), array(attended)), atol=1e-12)
-
-
 def test_whole_network_is_encoder_blocks_and_heads():
     """Each block has its own memory, which holds inputs of that block; the heads read the last block's output."""
     agent = make_agent(memory_length=3, num_blocks=2)
@@ -234,16 +228,6 @@ def test_initialisation():
         assert all(layer.bias is None for layer in projections)
     assert len(layers) == 1 + 3 * 8 + 4  # encoder; four projections, two gates, two of the MLP a block; two a head
     assert agent.actor_logstd.tolist() == [-0.75]
-
-
-def test_nothing_is_shared_between_blocks():
-    """Parameters counted from the paper's equations: every block and every gate has its own."""
-    agent = make_agent(num_blocks=3, memory_length=6)
-    d, heads, L, mlp, hidden = 8, 2, 6, 12, 10
-    gate, norm = 2 * d * d + d, 2 * d
-    block = 4 * d * d + heads * (L + 1) * (d // heads) + 2 * gate + 2 * norm + (d * mlp + mlp) + (mlp * d + d)
-    head = d * hidden + hidden + hidden + 1
-    assert sum(p.numel() for p in agent.parameters()) == (3 * d + d) + 3 * block + 2 * head + 1
 
 
 # --- cost -------------------------------------------------------------------------------------------------------------

@@ -118,13 +118,6 @@ def test_a_misspelt_attribute_is_refused(env_id):
     assert batch.flights_per_start == 2
 
 
-def test_the_wrappers_way_to_an_attribute():
-    """As docs/rocket.md has it: `unwrapped`; what is set on the wrapper alone does nothing."""
-    env = gym.make("RocketAscentCutoff-v0", action_frame="local")
-    env.unwrapped.mass_weight = 3.0
-    assert env.get_wrapper_attr("mass_weight") == 3.0 == env.unwrapped.batch.mass_weight
-
-
 @every_kind
 def test_a_single_environment_has_no_autoreset(env_id):
     with pytest.raises(BadInput, match="autoreset_mode is 'NextStep'; it must not be given"):

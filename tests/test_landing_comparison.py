@@ -17,7 +17,7 @@ FAILURE = {"failure_probability": 0.5, "failure_size": 2.5, "failure_time": "sta
 
 def test_the_printed_rows_are_reproduced():
     """DR/DV by the published end: means within three standard errors of the notebooks' rows, fuel within 2 %."""
-    rows = comparison.published_rows(ID, 0, 2000)
+    rows = comparison.published_rows(ID, 0, 1000)
     for name, printed in (
         ("drdv, p = 0, published end", "DR/DV, no failure"),
         ("drdv, p = 0.5, published end", "DR/DV"),
@@ -42,18 +42,6 @@ def test_a_law_is_compared_where_the_optimum_is_known():
     flown = comparison.fly_draws(ID, make_law, z, **FAILURE)["fuel_kg"]
     assert row["fuel_ratio"] == pytest.approx((flown[0] + flown[2]) / 400)
     assert (row["eval_starts"], row["reference_starts"]) == (6, 2)
-
-
-def test_the_table_has_a_line_for_each_row_and_no_number_where_there_is_none():
-    published = {name: dict(zip(comparison.PUBLISHED_KEYS, row)) for name, row in comparison.PUBLISHED.items()}
-    optimum = {"eval_starts": 7, "fuel_mean_kg": 207.0, "fuel_ratio": 1.0, "knows": "all"}
-    report = {"env_id": ID, "eval_seed": 0, "solved": 7, "laws": {"optimum": optimum}}
-    report |= {"published_law": {}, "published": published}
-    lines = comparison.table(report).splitlines()
-    (gru,) = [line for line in lines if "GRU" in line]
-    assert "0.30, 1.30" in gru and "294.9" in gru and " - " in gru
-    (best,) = [line for line in lines if line.startswith("  optimum")]
-    assert "207.0" in best and best.endswith("all")
 
 
 @pytest.fixture

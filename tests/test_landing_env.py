@@ -9,7 +9,6 @@ from scipy.integrate import solve_ivp
 
 import envs
 from common.errors import BadInput
-from landing.dynamics import burn
 from landing.environment import PERIOD, fly_lander, limited
 from landing.lander import DRAW, MARS, POWERED_DESCENT, flights
 from landing.rewards import has_landed, slope_reward
@@ -49,16 +48,6 @@ def test_flights_agree_with_dop853():
             y = solve_ivp(equation_of_motion, (0, 0.2), y, "DOP853", args=arguments, rtol=1e-12, atol=1e-9).y[:, -1]
             assert np.abs(y - after).max() < 1e-3
         assert acts.sum() > 50
-
-
-def test_the_closed_form_without_thrust_is_a_throw():
-    """With no time, nothing changes; with hardly any propellant flowing, the path is a parabola."""
-    r, v, g = np.array([[1.0], [2.0], [3.0]]), np.array([[4.0], [5.0], [6.0]]), np.array([[0.0], [0.0], [-3.7]])
-    direction = np.array([[0.0], [0.0], [1.0]])
-    still = burn(r, v, np.array([2000.0]), direction, np.array([2.0]), g, 0.0, 2060.0)
-    assert [np.array_equal(*pair) for pair in zip(still, (r, v, [2000.0]))] == [True] * 3
-    thrown = burn(r, v, np.array([2000.0]), direction, np.array([1e-9]), g, 10.0, 2060.0)
-    assert thrown[0] == pytest.approx(r + 10 * v + 50 * g, abs=1e-6)
 
 
 def test_an_empty_tank_ends_the_thrust():

@@ -97,15 +97,6 @@ def test_every_reference_lands_as_it_was_solved(mars):
     np.testing.assert_allclose(flown["u"], found["u"], atol=1e-2)  # nothing is clipped
 
 
-def test_arrays_are_nan_behind_the_last_period_alone(mars):
-    _, found = mars
-    periods = np.ceil(found["final_time"] / optimum.PERIOD - 1e-6).astype(int)
-    for k, count in enumerate(periods):
-        assert np.isfinite(found["u"][k, :count]).all() and np.isnan(found["u"][k, count:]).all()
-        assert np.isfinite(found["y"][k, : count + 1]).all() and np.isnan(found["y"][k, count + 1 :]).all()
-    assert np.isfinite(found["fuel_kg"]).all() and np.isfinite(found["final_time"]).all()
-
-
 def test_commands_lead_there_by_scipys_integrator(mars):
     """DOP853 with its own reading of the draw, of the failure and of the engine."""
     draw, found = mars

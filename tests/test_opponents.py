@@ -49,7 +49,7 @@ def linear():
     return flight, axes, *guidance.linearise_flight(ROCKETS[CUTOFF], flight, axes)
 
 
-@pytest.mark.parametrize("k", [3, 37, 75, 130, 300, 461])  # 37 to 130: steps with a staging; 462 is the last
+@pytest.mark.parametrize("k", [3, 37, 130, 461])  # 37 and 130: steps with a staging; 462 is the last
 def test_linearised_steps_are_scipys(linear, k):
     """Central differences of SciPy's integration between the stagings, with other differences and other axes."""
     flight, axes, A, B = linear
@@ -121,7 +121,7 @@ def test_by_energy_a_late_flight_is_no_other_flight():
     assert (np.linalg.norm(by_time - flight["u"][places], axis=1) > 0.01).all()
 
 
-@pytest.mark.parametrize("env_id", [CUTOFF, LEO])
+@pytest.mark.parametrize("env_id", [LEO])
 @pytest.mark.parametrize("by_energy", [False, True])
 def test_a_late_flight_is_steered_as_gently_as_the_one_before(env_id, by_energy):
     """The optimum's last step is a fraction of the others, and the angle that mends an error within it is large."""
@@ -220,27 +220,7 @@ def test_the_measured_engine_is_the_flight_s():
     assert t > 450
 
 
-def test_of_the_nominal_vehicle_the_measured_plan_is_the_nominal_one(monkeypatch):
-    """The nominal exhaust velocity by which it measures is that of the table's thrust and flow."""
-    monkeypatch.setattr(guidance, "REPLAN_EVERY", 100.0)
-    z, exhaust = np.zeros((1, SCORES)), guidance.nominal_exhaust(ROCKET)
-    assert exhaust == 110094 * 700 / 16820
-    laws = guidance.Replanning(CUTOFF), guidance.Replanning(CUTOFF, exhaust=exhaust)
-    nominal, measured = (ends(law, z)["final_y"] for law in laws)
-    np.testing.assert_allclose(laws[0].u, laws[1].u, atol=1e-5)
-    np.testing.assert_allclose(measured[0, :6], nominal[0, :6], rtol=1e-6)
-    assert len(laws[0].seconds) == len(laws[1].seconds) == 7
-
-
-def test_what_is_measured_takes_most_of_the_miss(monkeypatch):
-    monkeypatch.setattr(guidance, "REPLAN_EVERY", 40.0)
-    z, exhaust = draws(ROCKET, 1.0, 5, 5), guidance.nominal_exhaust(ROCKET)
-    nominal = ends(guidance.Replanning(CUTOFF), z)["error_norm"]
-    measured = ends(guidance.Replanning(CUTOFF, exhaust=exhaust), z)["error_norm"]
-    assert np.median(measured) < np.median(nominal) / 10 and measured.max() < 1e-5
-
-
-@pytest.mark.parametrize("step", [131, 249, 455])
+@pytest.mark.parametrize("step", [131, 455])
 def test_a_loss_of_thrust_is_measured(step):
     """A fifth, from before the last burn on, within the step before a plan, after the last plan that is due.
 
@@ -293,13 +273,6 @@ def test_a_measured_flow_that_leaves_nothing_to_burn_keeps_the_last_plan(flow):
         guidance.optimise_remaining(rocket, remaining, guess, (guidance.REPLAN_INTERVALS,))
     plan, _ = guidance.replan_one((rocket, remaining, guess))
     assert plan is None
-
-
-def test_the_optimum_that_knows_nothing_differs_is_the_reference():
-    (optimum,) = guidance.drawn_optima(CUTOFF, 1.0, np.zeros((1, SCORES)))
-    reference = rocket_reference(CUTOFF)
-    assert optimum["final_mass"] == pytest.approx(reference["reference_mass_kg"], abs=1e-4)
-    assert optimum["final_time"] == pytest.approx(reference["reference_time_s"], abs=1e-4)
 
 
 @pytest.mark.parametrize("env_id", [CUTOFF, LEO])
@@ -431,13 +404,9 @@ def test_report(compared):
     [
         (["{missing}"], "No such file"),
         (["{fixed}"], "the env_id of .* is RocketAscent-v0; it must be a rocket's with cut-off"),
-        (["{di}"], "the env_id of .* is DoubleIntegrator-v0; it must be a rocket's with cut-off"),
         (["{good}", "--starts=9"], "'9' must be a whole number from 10 to 100000"),
         (["{good}", "--starts=20", "--solved=21"], "--solved is 21; it must be at most 20, as --starts is"),
-        (["{good}", "--solved=1706"], "--solved is 1706; it must be at most 1705"),
-        (["{good}", "--dispersion=0"], "'0' must be a number above 0, at most 10"),
         (["{good}", "--dispersion=nan"], "'nan' must be a number above 0, at most 10"),
-        (["{good}", "--eval-seed=-1"], "'-1' must be a whole number"),
         (["{good}", "--also", "mine"], "'mine' must be NAME=PATH"),
         (
             ["{good}", "--also", "replan={good}/agent.safetensors"],

@@ -24,7 +24,6 @@ from common.errors import BadInput, NoOptimum
 from common.integration import falling_root
 from common.tasks import task_of
 from envs import PROBLEMS, Phase, Problem, fly
-from phased import optimum as phased_optimum
 from phased.problem import flights_of_seed
 from problems.cart_pole import CART_POLE, cart_pole
 from problems.goddard import GODDARD
@@ -341,15 +340,6 @@ def test_every_table_of_ours_trains_and_is_flown_again(env_id, tmp_path, monkeyp
         assert again[part] == pytest.approx(metrics[part], rel=1e-6), part
 
 
-def test_a_root_is_found_to_rounding():
-    """Of functions that are not straight: at 0, to 1e-12 of the value at the begin."""
-    roots = np.array([0.013, 0.4, 0.999])
-    value = lambda h: (roots - h) * (1 + 3 * h + 5 * h**2)  # noqa: E731
-    found = falling_root(value, value(np.zeros(3)), value(np.ones(3)), np.ones(3))
-    np.testing.assert_allclose(found, roots, rtol=0, atol=1e-12)
-    assert (value(found) <= 1e-12 * value(np.zeros(3))).all()
-
-
 def test_a_root_is_found_where_secants_stay_above_it():
     """Near-straight falls of a lander: 7 in 1000 were not found while a value of 1e-14 counted as above ground."""
     rng = np.random.default_rng(0)
@@ -399,18 +389,6 @@ def test_minimum_time(new_problem):
 
 
 @pytest.mark.slow
-def test_brachistochrone(new_problem):
-    """From (0, 10) to (10, 5) without friction: 1.8016 s. The control is the angle from straight down."""
-    phase = Phase(200, (None, 5.0, None), 1e-5, bonus=10.0, running=lambda x, u: 1.0, end=lambda x: 10 - x[0])
-    fall = lambda x, u: (x[2] * np.sin(u), -x[2] * np.cos(u), G * np.cos(u))  # noqa: E731
-    table = {"x0": (0.0, 10.0, 0.0), "guess": lambda x: 0.9}
-    problem = Problem("Brachistochrone-v0", fall, np.pi, (phase,), (50.0, 50.0, 50.0), 0.02, 0.0, **table)
-    flight, finer = optimum(problem, new_problem)
-    assert flight["final_time"][0] == pytest.approx(1.8016, abs=1e-4)
-    assert finer["finer_collocation_cost_mean"] == pytest.approx(1.8016, abs=5e-5)
-
-
-@pytest.mark.slow
 def test_goddard():
     """The greatest height of the classic constants is 1.01283 (COPS, problem "rocket"; Bryson 1999)."""
     x0, draw = flights_of_seed(GODDARD, 0, 1)
@@ -422,21 +400,12 @@ def test_goddard():
 
 
 def test_cart_pole_by_two_transcriptions(new_problem):
-    """Kelly's swing-up ends at a point. From a straight line we find his 58.8; another swing costs 57.95."""
+    """Kelly's swing-up ends at a point. His costs 58.8; another swing costs 57.95."""
     phase = replace(CART_POLE.phases[0], steps=50, radius=1e-4, Qf=0.0, bonus=100.0)
     kelly = replace(CART_POLE, env_id="Kelly-v0", phases=(phase,), dt=0.04, substeps=2)
     flight, finer = optimum(kelly, new_problem)
     assert finer["finer_cost_mean"] == pytest.approx(57.95, abs=0.02)
     assert finer["finer_collocation_cost_mean"] == pytest.approx(finer["finer_cost_mean"], abs=1e-3)
-    one = replace(kelly, env_id="KellyLine-v0")
-    new_problem(one)
-    x0, draw = flights_of_seed(one, 0, 1)
-    job = phased_optimum.Job(one.env_id, phased_optimum.shooting, True, 0, x0[0], draw[0])
-    line = list(phased_optimum.guesses(one, x0[0], draw[0]))[1]
-    coarse = phased_optimum.solve_on(one, phased_optimum.Mesh.of(one), job, line)
-    sketches = phased_optimum.sketches_of(one, coarse.mesh, x0[0], coarse.unknowns)
-    fine = phased_optimum.solve_on(one, coarse.mesh.refined(4), job, sketches)
-    assert fine.succeeded and fine.cost == pytest.approx(58.82, abs=0.03)
 
 
 def test_the_optimum_knows_the_hidden_parameters(new_problem):
@@ -498,9 +467,7 @@ def phase(**changes):
 SLIPS = {
     "four states": ({"f": lambda x, u: (x[2], x[3], u, u), "x_max": (10.0,) * 4}, "target of phase 1"),
     "one derivative": ({"f": lambda x, u: (x[1],)}, "the number of what f returns"),
-    "no tuple": ({"f": lambda x, u: x[1]}, "what f returns"),
     "control of the first flight": ({"f": lambda x, u: (x[1], u[0] - x[0])}, "what f of .* mixed over the flights"),
-    "mean of the flights": (phase(running=lambda x, u: np.mean(x[0]) ** 2), "what running of phase 1 .* mixed over"),
     "one guess for two controls": (
         {"f": lambda x, u: (x[1], u[0] + u[1]), "u_max": (1.0, 1.0), "guess": lambda x: (-x[0],)},
         "the number of what guess returns",
@@ -509,57 +476,39 @@ SLIPS = {
     "math.sin": ({"f": lambda x, u: (x[1], -math.sin(x[0]) + u)}, "f of .* NumPy's, as np.sin"),
     "max": ({"f": lambda x, u: (x[1], max(u, -x[0]))}, "f of .* decides by a value"),
     "in place": ({"f": in_place}, "f of .* changes its arguments in place"),
-    "raises": ({"f": lambda x, u: (x[1], u + undefined)}, "f of .* NameError"),  # noqa: F821
     "NaN": ({"f": lambda x, u: (x[1], u + np.sqrt(x[0] - 2))}, "a value of f .* NaN"),
-    "no function": ({"f": 3.0}, "f of Mine-v0 is 3.0"),
     "no comma": ({"phases": PHASE}, "phases of Mine-v0 .* comma"),
     "no phases": ({"phases": ()}, "phases of Mine-v0"),
     "steps 0": (phase(steps=0), "steps of phase 1"),
-    "steps 2.5": (phase(steps=2.5), "steps of phase 1"),
     "R negative": (phase(R=-0.1), "R of phase 1"),
-    "R of two": (phase(R=(0.1, 0.1)), "R of phase 1"),
     "Qf negative": (phase(Qf=-20.0), "Qf of phase 1"),
     "radius 0": (phase(radius=0.0), "radius of phase 1"),
-    "radius negative": (phase(radius=-0.05), "radius of phase 1"),
-    "radii of three": (phase(radius=(0.1, 0.1, 0.1)), "radius of phase 1"),
     "target of three": (phase(target=(0.0, 0.0, 0.0)), "target of phase 1"),
-    "target a number": (phase(target=1.0), "target of phase 1"),
-    "target NaN": (phase(target=(math.nan, 0.0)), "target of phase 1"),
     "radius without target": (phase(target=None), "radius of phase 1"),
     "bonus without radius": (phase(radius=math.inf), "bonus of phase 1"),
-    "Q a number": (phase(Q=1.0), "Q of phase 1"),
     "end no function": (phase(end=1.0), "end of phase 1"),
     "end below 0": (phase(end=lambda x: x[0] - 9.0), "end of phase 1 .* at a start"),
     "target beyond": (phase(target=(30.0, 0.0)), "target of phase 1 .* within x_max"),
     "running of two": (phase(running=lambda x: 1.0), "running of phase 1"),
-    "terminal NaN": (phase(terminal=lambda x: np.nan * x[0]), "a value of terminal of phase 1"),
     "u_max 0": ({"u_max": 0.0}, "u_max"),
-    "u_max negative": ({"u_max": -1.0}, "u_max"),
-    "u_max a pair": ({"u_max": (-1.0, 1.0)}, "u_max"),
     "u_min above": ({"u_min": 2.0}, "u_min"),
     "u_norm of one control": ({"u_norm": (0.5, 1.0)}, "u_norm"),
     "u_norm reversed": ({"u_max": (1.0, 1.0), "u_norm": (1.0, 0.5)}, "u_norm"),
     "x_max too small": ({"x_max": (0.1, 0.1)}, "x_max"),
-    "x_max of one": ({"x_max": (20.0,)}, "x_max has 1"),
     "x_max a number": ({"x_max": 20.0}, "x_max"),
     "dt 0": ({"dt": 0.0}, "dt"),
-    "dt negative": ({"dt": -0.1}, "dt"),
     "dt too long": ({"dt": 5.0}, "dt of Mine-v0 is 5.0; it is too long"),
     "x0_max negative": ({"x0_max": -1.0}, "x0_max"),
     "x0 of three": ({"x0": (0.0, 0.0, 0.0)}, "x0"),
-    "x0 without scores": ({"x0": lambda z: (z[0], z[0])}, "scores"),
     "parameters without scores": ({"parameters": lambda z: (1.0,)}, "scores"),
-    "bounds of one": ({"bounds": ((0.0, 1.0),)}, "bounds"),
     "bounds reversed": ({"bounds": ((1.0, 0.0), None)}, "bounds"),
     "starts out of bounds": ({"bounds": ((0.0, 1.0), None), "bound_price": 1.0}, "bounds .* must hold the starts"),
     "one u_max of two": ({"u_names": ("left", "right")}, "u_names .*u_max has 1"),
-    "u of two": ({"f": lambda x, u: (x[1], sum((lambda a, b: (a, b))(*u)))}, "f of Mine-v0 fails"),
     "bounds without a price": ({"bounds": ((-5.0, 5.0), None)}, "bound_price"),
     "x_scale 0": ({"x_scale": (0.0, 1.0)}, "x_scale"),
     "names of one": ({"x_names": ("angle",)}, "x_names"),
     "velocities beyond": ({"velocities": (2,)}, "velocities"),
     "substeps 0": ({"substeps": 0}, "substeps"),
-    "no version": ({"env_id": "Mine"}, "env_id"),
     "a space": ({"env_id": "My problem-v0"}, "env_id"),
 }
 

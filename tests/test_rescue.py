@@ -356,23 +356,6 @@ def test_the_saved_flight_that_burns_longest_is_kept(flown):
     assert not animation.sheet.cross.get_visible() and not animation.sheet.failed.get_visible()
 
 
-@pytest.mark.slow
-def test_table_figure_and_rows(flown, tmp_path):
-    _, metrics, arrays = flown
-    table = table_of(metrics)
-    lost = "up to 30% of thrust lost from a random moment of a burn on"
-    assert f"{metrics['failure_starts']} flights with a failure, {lost}; {metrics['failure_savable']} of them" in table
-    assert f"{metrics['dispersed_starts']} healthy flights at dispersion 1" in table
-    assert f"||error|| median {metrics['failure_error_median']:.6f}, p95" in table
-    labels = figure_of("dispersed.png", arrays, metrics).axes[2].get_legend_handles_labels()[1]
-    assert labels == ["policy, healthy flights", "policy, flights with a failure"]
-    assert {"draw", "final_y", "final_error", "failure"} <= task_of(CUTOFF).required_arrays(metrics)
-    (tmp_path / "seeds").mkdir()
-    for seed in (1, 2):
-        (tmp_path / "seeds" / f"{seed}.json").write_text(json.dumps(metrics | {"seed": seed}))
-    assert any("failures: saved of the savable" in line for line in evaluate.seed_lines(tmp_path))
-
-
 def test_failures_without_dispersion_have_no_dispersed_statistics(no_solves):
     metrics, arrays = evaluate.evaluate(CUTOFF, guidance.open_loop(CUTOFF), 7, 10, failure=0.01)
     assert not any(key.startswith("dispers") for key in metrics)
@@ -439,10 +422,7 @@ def test_a_training_with_failures_begins_as_a_dispersed_one():
     "argv, message",
     [
         (["--failure=0.31"], "error: --failure 0.31: must be between 0.0 and 0.3"),
-        (["--failure=-0.1"], "error: --failure -0.1: must be between 0.0 and 0.3"),
-        (["--failure=nan"], "error: --failure nan: must be between 0.0 and 0.3"),
         (["--failure=0.1", "--failure-time=late"], "error: --failure-time late: must be one of random, ignition"),
-        (["--failure=0.1", "--failure-time=start"], "error: --failure-time start: must be one of random, ignition"),
         (["--failure=0.1", f"--env-id={FIXED}"], "error: --failure 0.1: must be 0 where flights end at a fixed time"),
         (["--failure=0.1", "--no-observe-phase", "--recipe=paper"], "error: --no-observe-phase: not in a training"),
     ],
@@ -458,7 +438,6 @@ def test_flags_that_do_not_fit_are_one_line(argv, message):
     [
         ([FIXED, "--failure=0.1"], "error: --failure is 0.1; it must be 0 where flights end at a fixed time"),
         ([CUTOFF, "--failure=0.4"], "error: argument --failure: '0.4' must be a number from 0 to 0.3"),
-        ([CUTOFF, "--failure=nan"], "error: argument --failure: 'nan' must be a number from 0 to 0.3"),
         ([CUTOFF, "--failure=0.1", "--failure-time=late"], "error: argument --failure-time: invalid choice: 'late'"),
     ],
 )
@@ -527,28 +506,10 @@ def test_opponents_meet_the_same_failures(compared, capsys):
     assert (folder / "figures" / "opponents_at_ignition_by_loss.png").stat().st_size > 10_000
 
 
-@pytest.mark.slow
-def test_opponents_keep_what_rows_by_size_need(compared):
-    folder, flown = compared
-    with np.load(folder / "opponents_at_ignition.npz") as file:
-        arrays = {key: file[key] for key in file.files}
-    assert arrays["failure"].shape == (10, 3)
-    has_failed = arrays["failure"][:, 0] >= 0
-    assert (arrays["failure"][has_failed, 0] == 3).all()
-    np.testing.assert_array_equal(np.isfinite(arrays["best_mass_kg"]), has_failed | (np.arange(10) < 5))
-    np.testing.assert_allclose(arrays["best_mass_kg"][:5], [optimum["final_mass"] for optimum in flown.optima], 1e-5)
-    for name, ends in flown.arrays.items():
-        errors = np.linalg.norm(ends["final_error"], axis=1)
-        np.testing.assert_allclose(arrays[f"{name}_error_norm"], errors, rtol=1e-6)
-        np.testing.assert_allclose(arrays[f"{name}_final_mass_kg"], ends["final_y"][:, 6], rtol=1e-6)
-        assert len(arrays[f"{name}_mass_reached_kg"]) == len(errors)
-
-
 @pytest.mark.parametrize(
     "argv, line",
     [
         (["--failure=0.4"], "error: argument --failure: '0.4' must be a number from 0 to 0.3"),
-        (["--failure=nan"], "error: argument --failure: 'nan' must be a number from 0 to 0.3"),
         (["--failure=0.1", "--failure-time=late"], "evaluate.py: failure_time is 'late'; it must be one of random"),
     ],
 )
@@ -561,7 +522,7 @@ def test_opponents_that_do_not_fit_are_one_line(monkeypatch, tmp_path, argv, lin
     assert str(refusal.value).startswith(line) and "\n" not in str(refusal.value)
 
 
-@pytest.mark.parametrize("flag", ["--dispersion=1", "--failure-time=ignition", "--starts=5", "--seed=7"])
+@pytest.mark.parametrize("flag", ["--dispersion=1", "--starts=5"])
 def test_flags_of_failing_flights_need_a_failure(monkeypatch, flag):
     monkeypatch.setattr("rocket.task.report_rocket", None)  # nothing is solved
     monkeypatch.setattr("sys.argv", ["baselines.py", "RocketAscentCutoff-v0", flag])

@@ -3,7 +3,6 @@
 import hashlib
 import importlib
 import json
-import re
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,6 @@ import run_seeds
 import safetensors
 
 import envs
-from common import curves
 
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "results"
@@ -59,41 +57,3 @@ def test_a_policy_was_trained_by_the_command_that_its_list_gives(folder, monkeyp
     differ = {name for name, value in job.args.items() if given(name, args[name]) != given(name, value)}
     assert differ <= {"exp_name", "eval_starts"}
     assert on_gpu or set(job.command[1::2]) <= {"--env-id", "--dispersion", "--failure", "--seed"}
-
-
-def test_held_out_runs_are_the_results_commands_with_other_seeds(monkeypatch):
-    """Two a row, no seed twice; all are measured on the starts and draws of one seed that no result has."""
-    monkeypatch.chdir(ROOT)
-    shipped = {job.results.name: job.args for job in run_seeds.read_jobs("benchmarks/result_jobs.txt")}
-    held_out = run_seeds.read_jobs("benchmarks/held_out_jobs.txt")
-    assert sorted(job.results.name for job in held_out) == sorted(2 * list(shipped))
-    for job in held_out:
-        assert job.results.parent.name == "held_out"
-        differ = {name for name, value in job.args.items() if value != shipped[job.results.name][name]}
-        assert differ == {"seed", "eval_seed"}
-    (eval_seed,) = {job.args["eval_seed"] for job in held_out}
-    seeds = [job.args["seed"] for job in held_out]
-    assert len({*seeds, eval_seed, 0}) == len(seeds) + 2 and not {*seeds, eval_seed} & {1, 2, 3, 4, 5}
-
-
-def test_table_1_s_rocket_is_the_last_evaluation_of_its_curve():
-    """And its table is that of all evaluations, with the sampled flights' median as it was printed then."""
-    folder = RESULTS / "table_1" / "rocket"
-    metrics, curve = json.loads((folder / "seeds/1.json").read_text()), curves.read_csv(folder / "seeds/1.csv")
-    for key in set(metrics) - {"env_id", "device", "torch_version"}:  # a curve holds no words
-        assert curve[f"eval/{key}"][1][-1] == pytest.approx(float(metrics[key]), rel=5e-6), key
-    sampled = dict(re.findall(r"update (\d+)/.* sampled error (\S+)  mean", (folder / "training.log").read_text()))
-    updates, seconds, misses, perigees = (
-        curve[f"eval/{key}"][1] for key in ("total_updates", "training_seconds", "error_norm", "perigee_km")
-    )
-    returns = curve["charts/episodic_return"][1][updates.astype(int) - 1]
-    expected = [
-        f"| {n:.0f} | {s / 60:.1f} | {g:.2f} | {float(sampled[f'{n:.0f}']):.3f} | {miss:.3f} | {perigee:.0f} |"
-        for n, s, g, miss, perigee in zip(updates, seconds, returns, misses, perigees, strict=True)
-    ]
-    page = (folder / "README.md").read_text().replace("−", "-").splitlines()
-    assert [line for line in page if re.match(r"\| \d", line)] == expected
-
-
-def test_every_file_of_the_results_is_below_40_megabytes():
-    assert max(path.stat().st_size for path in RESULTS.rglob("*") if path.is_file()) < 40e6

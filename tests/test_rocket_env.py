@@ -4,14 +4,12 @@
 
 import math
 import warnings
-from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
-from gymnasium.vector import AutoresetMode
 from rocket_oracle import (
     CUTOFF,
     FIXED,
@@ -32,7 +30,7 @@ from rocket_oracle import (
     unit,
 )
 
-from envs import ROCKETS, Rocket, RocketVectorEnv, ascent_dynamics, fly_rocket, local_frame, rk4
+from envs import Rocket, RocketVectorEnv, fly_rocket
 
 REGISTERED, IDS = [FIXED, CUTOFF, LEO], [FIXED, CUTOFF, LEO_FIXED, LEO]
 KEYS = {
@@ -84,131 +82,7 @@ def test_start(v):
     assert info == {} and np.linalg.norm(obs[0, :3]) == pytest.approx(RE, rel=1e-15)
 
 
-def masses(v, table_isp=False):
-    """The flown mass by time."""
-    u = v.reference(table_isp)[0]
-    return dict(zip(v.grid, fly(make(v.fixed, table_isp=table_isp), lambda obs, t: u[t])[0][:, 6]))
-
-
-def test_mass_history_to_the_gram():
-    m = masses(PAPER)
-    for event, before, dropped in ((75.2, 171863.885, 13680), (150.4, 79623.770, 6840), (261.0, 32294.000, 8830)):
-        left, right = math.floor(event / 2) * 2.0, math.floor(event / 2) * 2.0 + 2
-        flow_before, flow_after = (m[left - 2] - m[left]) / 2, (m[right] - m[right + 2]) / 2
-        at_event = m[left] - flow_before * (event - left)
-        assert at_event == pytest.approx(before, abs=1e-3)
-        assert m[right] + flow_after * (right - event) == pytest.approx(at_event - dropped, abs=1e-6)
-    assert m[0.0] == 301454
-    assert m[262.0] == pytest.approx(23464 - 16820 / 700, abs=1e-6)
-    assert flow_after == pytest.approx(24.02857, abs=1e-5)
-    assert m[960.0] == pytest.approx(6668.02857, abs=1e-4) and m[961.0] == pytest.approx(6644, abs=1e-6)
-
-
-def test_mass_history_of_two_stages():
-    """Its staging is at a step's end: what is dropped is gone there."""
-    m, flow = masses(TWO_STAGE), 107500 / 393
-    assert m[0.0] == 564500 and m[160.0] == pytest.approx(564500 - 160 * 411000 / 162, abs=1e-6)
-    assert m[162.0] == pytest.approx(564500 - 433000, abs=1e-6)
-    assert m[164.0] == pytest.approx(131500 - 2 * flow, abs=1e-6)
-    assert m[554.0] == pytest.approx(24000 + flow, abs=1e-6) and m[555.0] == pytest.approx(24000, abs=1e-6)
-
-
-def test_table_isp_runs_dry_and_keeps_the_residual():
-    m = masses(PAPER, True)
-    flow = (m[950.0] - m[952.0]) / 2
-    assert flow == pytest.approx(110094 / (9.80665 * 462.4), rel=1e-9)
-    assert 952 + (m[952.0] - m[954.0]) / flow == pytest.approx(953.79, abs=5e-3)
-    assert m[954.0] == m[956.0] == m[960.0] == m[961.0]
-    solids, first = 17010 - 75.2 * 628500 / (9.80665 * 284), 95550 - 261 * 1083100 / (9.80665 * 301.7)
-    assert m[961.0] == pytest.approx(4164 + 19300 - 16820 + 9 * solids + first, abs=1e-6)
-    m = masses(TWO_STAGE, True)
-    assert (m[300.0] - m[302.0]) / 2 == pytest.approx(934e3 / (9.80665 * 348), rel=1e-9)
-    left = 411000 - 162 * 7.6e6 / (9.80665 * 306)
-    last = pytest.approx(107500 - 392 * 934e3 / (9.80665 * 348), abs=1e-6)  # burnt in the last second
-    assert m[555.0] == pytest.approx(24000 + left, abs=1e-6) and m[554.0] - m[555.0] == last
-
-
-def dry_vehicle(v, thrust=1, **changes):
-    """The rocket without drag; with `thrust=0` only the engines that are dropped first push, or it would not fly."""
-    rocket = ROCKETS[v.cutoff].rocket
-    first = [engine for _, engine in rocket.burns[0].dropped]
-
-    def idle(parts):
-        return tuple((n, e if e in first else replace(e, thrust=thrust * e.thrust)) for n, e in parts)
-
-    burns = tuple(replace(burn, engines=idle(burn.engines), dropped=idle(burn.dropped)) for burn in rocket.burns)
-    return replace(rocket, burns=burns, Cd=0.0, **changes)
-
-
-@both
-def test_coast_conserves_energy_and_angular_momentum(v):
-    envs = make(v.fixed, 3, rocket=dry_vehicle(v, thrust=0, omega_e=0.0))
-    envs.reset()
-    envs.unwrapped.y[:6] = np.array([v.on_goal_orbit(anomaly) for anomaly in (-1.0, 0.1, 2.0)]).T
-    envs.unwrapped.t[:] = idle = math.ceil(v.guided_until / 2)  # the step after which what pushes is gone
-    states = [envs.step(np.eye(3))[0][:, :7] for _ in range(v.steps - 1 - idle)]
-    E = np.array([[energy(s) for s in row] for row in states])
-    h = np.cross(np.array(states)[..., :3], np.array(states)[..., 3:6])
-    np.testing.assert_allclose(E, v.goal_energy, rtol=1e-11)
-    np.testing.assert_allclose(h, np.broadcast_to(v.goal_h * v.plane[:, 2], h.shape), rtol=0, atol=1e-11 * v.goal_h)
-    # the same by the integrator alone, along a quarter of the orbit and back
-    s, rocket = (*v.on_goal_orbit(0.0), 1000.0), dry_vehicle(v)
-    for dt in [4.0] * 1000 + [-4.0] * 1000:
-        s = rk4(lambda x, u: ascent_dynamics(x, u, rocket), s, (1.0, 0.0, 0.0, 0.0, 0.0), dt)
-        assert energy(s) == pytest.approx(v.goal_energy, rel=1e-9)
-    np.testing.assert_allclose(s[:3], v.on_goal_orbit(0.0)[:3], atol=1.0)
-
-
-@both
-def test_in_plane_steering_keeps_the_plane(v):
-    envs = make(v.fixed, 2, rocket=dry_vehicle(v, omega_e=0.0), action_frame="local")
-    envs.reset()
-    # a low circle is flown three times as high, or the thrust would drive it into the ground
-    scale = np.array([1.0] * 6 if v.e else [3.0] * 3 + [3**-0.5] * 3)
-    envs.unwrapped.y[:6] = np.array([scale * v.on_goal_orbit(1.0), scale * v.on_goal_orbit(2.0)]).T
-    before = np.linalg.norm(np.cross(envs.unwrapped.y[:3].T, envs.unwrapped.y[3:6].T), axis=1)
-    for pitch in np.linspace(-1.5, 2.0, v.steps - 1):
-        up, along = math.sin(pitch), math.cos(pitch)
-        obs, _, terminated, *_ = envs.step([[up, along, 0.0], [-up, 2 * along, 0.0]])
-        assert not terminated.any()
-        h = np.cross(obs[:, :3], obs[:, 3:6])
-        direction = h / np.linalg.norm(h, axis=1, keepdims=True)
-        np.testing.assert_allclose(direction, [v.plane[:, 2]] * 2, rtol=0, atol=1e-12)
-    assert (np.abs(np.linalg.norm(h, axis=1) / before - 1) > 0.1).all(), "the thrust should have acted"
-
-
-@both
-@pytest.mark.parametrize("side", ["east", "up", "north"])
-def test_air_turns_with_the_earth(v, side):
-    """At rest in the inertial frame the wind blows eastwards; at rest on the turning ground there is none."""
-    still, ground = [*v.start[:3], 0.0, 0.0, 0.0, 1e5], v.start[:6] + [1e5]
-    wind = {"east": (0, 100, 0), "up": (80, 0, 60), "north": (-60, 0, 80)}[side]
-    moving = [*v.start[:3], *(a + b for a, b in zip(v.start[3:6], wind)), 1e5]
-    off = (1.0, 0.0, 0.0, 0.0, 0.0)
-    gravity = -MU / RE**3 * np.array(v.start[:3])
-    drag = [np.array(ascent_dynamics(s, off, ROCKETS[v.cutoff].rocket)[3:6]) - gravity for s in (still, ground, moving)]
-    pressure = 0.5 * 1.225 * 0.5 * v.area / 1e5
-    np.testing.assert_allclose(drag[0], [0, pressure * v.start[4] ** 2, 0], rtol=1e-12, atol=1e-13)
-    np.testing.assert_allclose(drag[1], 0, atol=1e-13)
-    np.testing.assert_allclose(drag[2], [-pressure * 100 * c for c in wind], rtol=1e-9, atol=1e-13)
-
-
 # --- steering ---------------------------------------------------------------------------------------------------------
-
-
-@both
-def test_local_frame(v):
-    rng = np.random.default_rng(4)
-    states = rng.normal(size=(7, 50)) * 7e6
-    frames = np.moveaxis(local_frame(states, v.plane[:, 2]), 2, 0)
-    for s, frame in zip(states.T, frames):
-        np.testing.assert_allclose(frame @ frame.T, np.eye(3), atol=1e-14)
-        assert np.linalg.det(frame) == pytest.approx(1)
-        np.testing.assert_allclose(frame, v.up_along_cross(s), atol=1e-13)
-    flight = np.array([v.on_goal_orbit(anomaly) for anomaly in np.linspace(0, 6, 9)])
-    frames = local_frame(np.column_stack([flight, flight[:, 0]]).T, v.plane[:, 2])
-    assert ((frames[1] * flight[:, 3:].T).sum(axis=0) > 0).all(), "along-track is the direction of flight"
-    np.testing.assert_allclose(frames[2], np.repeat(v.plane[:, 2:], 9, axis=1), atol=1e-14)
 
 
 @pytest.mark.parametrize("env_id", [CUTOFF, LEO])
@@ -441,12 +315,8 @@ def test_single_environment_is_the_vector_environment(v):
     "env_id, steering, last",
     [
         (FIXED, "ascent", 481),
-        (CUTOFF, "over the top", 481),
         (CUTOFF, "ascent", None),
-        (FIXED, "late dive", None),
         (CUTOFF, "early crash", None),
-        (LEO_FIXED, "ascent", 278),
-        (LEO, "ascent", None),
     ],
 )
 def test_steps_outside_an_episode_are_refused(env_id, steering, last):
@@ -491,15 +361,6 @@ def advance_from(env_id, states, t, actions):
 
 
 @both
-def test_plunging_row_of_a_batch_is_a_batch_of_one(v):
-    up, along, _ = v.up_along_cross(v.start)
-    states = [[*(RE + h) * up, *v * (0.9 * along - 0.43 * up), 15000.0] for h, v in ((12e3, 7800), (3e3, 9000))]
-    both = advance_from(v.fixed, states, 200, [up, up])[0]
-    for n in range(2):
-        np.testing.assert_array_equal(advance_from(v.fixed, states[n : n + 1], 200, [up])[0][0], both[n])
-
-
-@both
 def test_cut_off_row_of_a_batch_is_a_batch_of_one(v):
     u, y, (time, _) = v.reference(False)
     last, rng = int(time // 2), np.random.default_rng(8)
@@ -518,8 +379,8 @@ def test_cut_off_row_of_a_batch_is_a_batch_of_one(v):
 # --- end time ---------------------------------------------------------------------------------------------------------
 
 
-FLIGHTS = [(924.139, 463), (2.0, 1), (1.0, 1), (76.0, 38), (75.2, 38), (262.0, 131), (3, 2), (961.0, 481)]
-FLIGHTS_OF_TWO_STAGES = [(541.3, 271), (1.0, 1), (162.0, 81), (163.0, 82), (555.0, 278)]
+FLIGHTS = [(924.139, 463), (1.0, 1), (75.2, 38)]
+FLIGHTS_OF_TWO_STAGES = [(163.0, 82)]
 
 
 @pytest.mark.parametrize(
@@ -549,7 +410,7 @@ def test_end_time(v, end_time, steps, alone):
 
 
 @both
-@pytest.mark.parametrize("value", [0, -1, math.nan, 962, 555.1, math.inf, -math.inf])
+@pytest.mark.parametrize("value", [0, math.nan, 962, 555.1])
 def test_bad_end_times_are_refused(v, value):
     if value == 555.1 and v is PAPER:
         pytest.skip("within its 961 s")
@@ -557,17 +418,6 @@ def test_bad_end_times_are_refused(v, value):
         with pytest.raises(ValueError, match=rf"end_time is {value} "):
             env.unwrapped.end_time = value
         assert env.unwrapped.end_time == v.end
-
-
-@both
-@pytest.mark.parametrize("value", [1e-10, 2e-9])
-def test_tiny_end_time_is_one_step_or_refused(v, value):
-    envs = make(v.fixed)
-    try:
-        envs.unwrapped.end_time = value
-    except ValueError as error:
-        assert "end_time is" in str(error)
-    assert envs.unwrapped.episode_steps == (1 if envs.unwrapped.end_time == value else v.steps)
 
 
 @pytest.mark.parametrize("v, end_time", [(PAPER, 100.0), (PAPER, 200.0), (TWO_STAGE, 160.0)])
@@ -579,16 +429,6 @@ def test_short_flights_know_no_last_phase(v, end_time, monkeypatch):
     *_, final = fly(envs, lambda obs, t: v.programme(2 * t))
     assert final["final_time_s"] == end_time
     assert final["R_penalties"] > -1
-
-
-@both
-def test_end_time_changes_between_episodes(v):
-    envs = make(v.fixed, action_frame="local")
-    for end_time, steps in ((100.0, 50), (424.139, 213), (v.end, v.steps)):
-        envs.unwrapped.end_time = end_time
-        seen, rewards, final = fly(envs, lambda obs, t: v.programme(2 * t))
-        assert (len(rewards), final["final_time_s"]) == (steps, end_time)
-        assert final["episodic_return"] == pytest.approx(rewards.sum(), abs=1e-10)
 
 
 # --- bad and odd input ------------------------------------------------------------------------------------------------
@@ -653,29 +493,10 @@ def test_other_bad_input_is_refused():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("env_id", REGISTERED)
-@pytest.mark.parametrize("action_frame", ["eci", "local"])
-@pytest.mark.parametrize("table_isp", [False, True])
-@pytest.mark.parametrize("observe_phase", [True, False])
-def test_check_env(env_id, action_frame, table_isp, observe_phase):
-    env = gym.make(env_id, action_frame=action_frame, table_isp=table_isp, observe_phase=observe_phase)
+def test_check_env(env_id):
+    env = gym.make(env_id)
     assert env.spec.max_episode_steps is None
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         check_env(env.unwrapped)
     assert not [str(w.message) for w in caught if "symmetric and normalized" not in str(w.message)]
-
-
-@pytest.mark.parametrize("env_id", REGISTERED)
-@pytest.mark.parametrize("num_envs", [1, 1000])
-def test_vector_environment_is_native(env_id, num_envs):
-    envs = gym.make_vec(env_id, num_envs=num_envs)
-    assert isinstance(envs.unwrapped, RocketVectorEnv)
-    assert envs.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP and envs.spec.max_episode_steps is None
-    assert envs.unwrapped.episode_steps == VEHICLES[env_id].steps
-    obs, _ = envs.reset(seed=0)
-    assert obs.shape == (num_envs, 9) and obs.dtype == np.float64 and envs.observation_space.contains(obs)
-    for _ in range(3):
-        obs, rewards, terminated, truncated, info = envs.step(np.tile([1.0, 0.0, 0.5], (num_envs, 1)))
-    assert rewards.shape == terminated.shape == truncated.shape == (num_envs,) and info == {}
-    assert obs.dtype == rewards.dtype == np.float64 and envs.observation_space.contains(obs)
-    assert (obs == obs[0]).all() and envs.single_action_space.shape == (3,)

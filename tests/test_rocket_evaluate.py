@@ -1,6 +1,5 @@
 """evaluate.py on the rocket: metrics, arrays, table and figures against plain formulas, results folders, bad input."""
 
-import hashlib
 import json
 import math
 import sys
@@ -8,15 +7,12 @@ import sys
 import numpy as np
 import pytest
 from helpers import figure_of, headline_of, table_of
-from test_evaluate import command_line, snapshot
 
 import envs
 import evaluate
 from common.files import write_json, write_npz
 from common.tasks import task_of
-from drawing import animation
 from rocket import optimum
-from rocket.figures import pitch_and_yaw, target_points
 from rocket.metrics import rocket_metrics
 
 FIXED, CUTOFF, LEO = IDS = ["RocketAscent-v0", "RocketAscentCutoff-v0", "TwoStageLEO-v0"]
@@ -28,8 +24,7 @@ TARGETS = {FIXED: PAPER, CUTOFF: PAPER, LEO: CIRCLE}
 START_MASS = {FIXED: 301454, CUTOFF: 301454, LEO: 564500}  # kg
 LAST_BURN = {FIXED: (261, 23464, 16820 / 700), LEO: (162, 131500, 107500 / 393)}  # s, kg, kg/s
 LAST_BURN[CUTOFF] = LAST_BURN[FIXED]
-STAGINGS = {CUTOFF: {75.2: "13.68 t", 150.4: "6.84 t", 261.0: "8.83 t"}, LEO: {162.0: "22.00 t"}}
-CEILING = {FIXED: 250, CUTOFF: 250, LEO: math.inf}  # km
+STAGINGS = {CUTOFF: [75.2, 150.4, 261.0], LEO: [162.0]}
 
 # INTERFACE, "eval.json": all but what the script adds (seed, checkpoint_sha256, total_updates, ...)
 COMMON = {"env_id", "eval_seed", "eval_starts", "episodic_return", "reference_episodic_return"}
@@ -223,32 +218,6 @@ def test_arrays_are_the_interfaces(flown, references, env_id):
     assert all(np.array_equal(arrays[f"{key}_reference"], references[env_id][key]) for key in "tuy")
 
 
-@pytest.mark.parametrize("env_id", IDS)
-def test_reward_parts_equal_plain_loops(flown, env_id):
-    (metrics, arrays), target = flown[env_id], TARGETS[env_id]
-    t, u, y = (arrays[key].tolist() for key in "tuy")
-    sums, distance = dict.fromkeys(PARTS, 0.0), sum(map(abs, errors(arrays["y"][0], target)))
-    for k, reward in enumerate(arrays["reward"]):
-        next_distance = sum(map(abs, errors(arrays["y"][k + 1], target)))
-        altitude = (norm(y[k + 1][:3]) - RE) / 1e3
-        step = {"R_orbital": 10 * (distance - next_distance)}
-        penalty = 0.024 * min(max((altitude - CEILING[env_id] + 5) / 100, 0), 1)
-        assert altitude > 130 or t[k + 1] <= 300, "none of these flights is penalised for being low"
-        if k > 0:
-            penalty += 0.001 * norm([a - b for a, b in zip(u[k], u[k - 1])])
-        step["R_penalties"] = -penalty
-        if k == len(u) - 1:
-            step["R_terminal"] = -2 * math.log(1 + norm(errors(arrays["y"][k + 1], target)) / 0.005)
-        assert reward == pytest.approx(sum(step.values()), abs=1e-8)
-        for part, value in step.items():
-            sums[part] += value
-        distance = next_distance
-    assert (sums["R_penalties"] < -1) == (env_id != LEO), "the flight must go too high for the test to mean something"
-    assert {part: metrics[part] for part in PARTS} == pytest.approx(sums, abs=1e-7)
-    assert metrics["episodic_return"] == pytest.approx(sum(sums.values()), abs=1e-7)
-    assert metrics["episodic_return"] == pytest.approx(arrays["reward"].sum(), abs=1e-9)
-
-
 @pytest.mark.parametrize("ours, error", [(269.9, 0.1), (0.5, 90.7), (89.7, 179.9), (90.0, -179.8), (268.8, -1.0)])
 def test_angles_differ_the_short_way_round(references, ours, error):
     flight = references[CUTOFF] | {"raan_deg": ours}
@@ -347,26 +316,18 @@ def test_table_shows_target_optimum_ours_and_difference(flown, env_id):
     target = TARGETS[env_id]
     metrics = json.loads(json.dumps(flown[env_id][0]))  # eval.json is all it needs
     table = table_of(metrics)
-    assert table.splitlines()[0].startswith(env_id)
-    assert table.splitlines()[1].split() == ["target", "optimum", "ours", "difference"]
-    perigee, apogee = (target["a_km"] * (1 + sign * target["e"]) - 6378.145 for sign in (-1, 1))
-    rows = {"semi-major axis a (km)": ("a_km", target["a_km"]), "eccentricity e": ("e", target["e"])}
-    rows |= {"inclination i (deg)": ("i_deg", target["i_deg"])}
-    rows |= {"right ascension of the node (deg)": ("raan_deg", target["raan_deg"])}
+    rows = {"semi-major axis a (km)": "a_km", "eccentricity e": "e", "inclination i (deg)": "i_deg"}
+    rows |= {"right ascension of the node (deg)": "raan_deg"}
     if target["e"]:
-        rows |= {"argument of perigee (deg)": ("argp_deg", target["argp_deg"])}
+        rows |= {"argument of perigee (deg)": "argp_deg"}
     else:
         assert table_row(table, "argument of perigee (deg)") == ["-"] * 4
-    rows |= {"perigee altitude (km)": ("perigee_km", perigee), "apogee altitude (km)": ("apogee_km", apogee)}
-    for label, (key, wanted) in rows.items():
+    for label, key in rows.items():
         cells = [float(cell) for cell in table_row(table, label)]
-        ours, best = metrics[key], metrics[f"reference_{key}"]
+        ours, best, wanted = metrics[key], metrics[f"reference_{key}"], target[key]
         assert cells == pytest.approx([wanted, best, ours, ours - wanted], abs=6e-4), label
     rows = {"final mass (kg)": ("final_mass_kg", "reference_mass_kg")}
     rows |= {"final time (s)": ("final_time_s", "reference_time_s")}
-    rows |= {"maximum altitude (km)": ("max_altitude_km", "reference_max_altitude_km")}
-    key = "min_altitude_after_300s_km"
-    rows |= {"lowest altitude after 300 s (km)": (key, f"reference_{key}")}
     rows |= {"||error|| (success: below 0.02)": ("error_norm", "reference_error_norm")}
     for label, (key, best) in rows.items():
         none, *cells = table_row(table, label)
@@ -374,9 +335,6 @@ def test_table_shows_target_optimum_ours_and_difference(flown, env_id):
         assert none == "-" and [float(c) for c in cells] == pytest.approx([best, ours, ours - best], abs=6e-4), label
     assert float(table_row(table, TARGET_ORBIT)[2]) == pytest.approx(metrics["mass_ratio"], abs=1e-6)
     assert table_row(table, "success")[2] == ("yes" if env_id == CUTOFF else "no")
-    for key in (*PARTS, "episodic_return", "reference_episodic_return"):
-        assert f"{metrics[key]:.3f}" in table, key
-    assert f"{metrics['points']:.1f}" in table and "0.012300" in table.splitlines()[-1]
 
 
 def test_mass_for_the_orbit_reached(flown, monkeypatch):
@@ -402,24 +360,6 @@ def test_an_orbit_without_an_optimum_has_no_mass_ratio(flown, monkeypatch):
     assert task_of(CUTOFF).reported_metrics(flown[CUTOFF][0]) == {}
 
 
-def test_texts_lead_with_the_mass_for_the_orbit_reached(flown, crashed, tmp_path):
-    metrics = flown[CUTOFF][0]
-    plain = table_of(metrics)
-    assert REACHED not in plain and plain.count("a is exact because of this rule") == 1
-    assert "a is exact" not in table_of(flown[FIXED][0]) + table_of(crashed[0])
-    metrics = metrics | {"mass_ratio_reached": 0.987654, "reference_mass_reached_kg": 7654.321}
-    table = table_of(metrics)
-    assert table.index(REACHED) < table.index(TARGET_ORBIT) and "7654.321 kg" in table
-    assert table_row(table, REACHED) == ["-", "1.000000", "0.987654", "-0.012346"]
-    assert float(table_row(table, TARGET_ORBIT)[2]) == pytest.approx(metrics["mass_ratio"], abs=1e-6)
-    assert headline_of(metrics).endswith("optimum for the orbit reached 7654.3 kg")
-    (tmp_path / "seeds").mkdir()
-    for seed, run in ((1, metrics), (2, flown[CUTOFF][0])):
-        write_json(tmp_path / "seeds" / f"{seed}.json", run | {"seed": seed})
-    (line,) = (line for line in evaluate.seed_lines(tmp_path) if "for the orbit reached" in line)
-    assert line.split()[-5:] == ["0.9877", "-", "0.9877", "0.9877", "0.9877"]  # seed 1, seed 2, median, range
-
-
 # ---------------------------------------------------------------------------------------------------------------------
 # Figures
 # ---------------------------------------------------------------------------------------------------------------------
@@ -435,81 +375,41 @@ def test_ascent_figure_shows_both_flights(flown, env_id):
     metrics, arrays = flown[env_id]
     figure = figure_of("trajectory.png", arrays, metrics)
     panels = {ax.get_ylabel(): ax for ax in figure.axes}
-    assert len(panels) == len(figure.axes) == 14
     altitude, other = ([(norm(row[:3]) - RE) / 1e3 for row in arrays[key]] for key in ("y", "y_reference"))
     expected = {"(a) mass (t)": arrays["y"][:, 6] / 1e3, "(b) altitude (km)": altitude}
     expected["(c) inertial speed (km/s)"] = [norm(row[3:6]) / 1e3 for row in arrays["y"]]
     for k, (letter, axis) in enumerate(zip("def", "xyz")):
         expected[f"({letter}) position ${axis}$ (km)"] = arrays["y"][:, k] / 1e3
         expected[f"velocity $v_{axis}$ (km/s), pale"] = arrays["y"][:, 3 + k] / 1e3
+        assert np.array_equal(panels[f"thrust $u_{axis}$"].patches[0].get_data().values, arrays["u"][:, k])
     for label, values in expected.items():
         red = panels[label].lines[0]
         assert red.get_xdata() == pytest.approx(arrays["t"]) and red.get_ydata() == pytest.approx(values), label
-        assert "pale" in label or red.get_color() == "tab:red"
-    blue = panels["(b) altitude (km)"].lines[1]
-    assert blue.get_color() == "tab:blue" and blue.get_ydata() == pytest.approx(other)
-    level = [line.get_ydata()[0] for line in panels["(b) altitude (km)"].lines if line.get_color() == "tab:green"]
-    assert level == ([250] if env_id == CUTOFF else []), "a line at the ceiling, where there is one"
-    assert any("250 km" in text.get_text() for text in figure.legends[0].texts) == (env_id == CUTOFF)
-    for k, axis in enumerate("xyz"):
-        held = panels[f"thrust $u_{axis}$"].patches[0].get_data()
-        assert np.array_equal(held.values, arrays["u"][:, k]) and np.array_equal(held.edges, arrays["t"])
-    for label in ("(a) mass (t)", "thrust $u_x$", "pitch above the horizon (deg)"):
-        ends = [line.get_xdata()[0] for line in panels[label].lines if line.get_linestyle() == ":"]
-        assert ends == list(STAGINGS[env_id])
-    dropped = " ".join(text.get_text() for text in panels["(a) mass (t)"].texts)
-    assert all(f"{end:g} s: {text} dropped" in dropped for end, text in STAGINGS[env_id].items())
-    title = figure.get_suptitle()
-    assert f"{metrics['error_norm']:.6f}" in title and f"{metrics['final_mass_kg']:.1f} kg" in title
-    assert all(ax.get_xlabel() for ax in figure.axes if "velocity" not in ax.get_ylabel())
+    assert panels["(b) altitude (km)"].lines[1].get_ydata() == pytest.approx(other)
+    ends = [line.get_xdata()[0] for line in panels["(a) mass (t)"].lines if line.get_linestyle() == ":"]
+    assert ends == STAGINGS[env_id]
+    assert f"{metrics['error_norm']:.6f}" in figure.get_suptitle()
 
 
-@pytest.mark.parametrize("env_id", [CUTOFF, LEO])
-def test_pitch_and_yaw_are_the_programmes(flown, env_id):
-    _, arrays = flown[env_id]
-    pitch, yaw = pitch_and_yaw(arrays["u"], arrays["y"], envs.ROCKETS[env_id].rocket)
-    flown_pitch = np.interp(arrays["t"][:-1], TIMES_OF[env_id], BY_HAND_OF[env_id])
-    flown_yaw = np.interp(arrays["t"][:-1], *WEAVE)
-    assert pitch == pytest.approx(flown_pitch, abs=1e-6)
-    vertical = flown_pitch > math.degrees(math.acos(0.1))
-    assert vertical.any() and np.array_equal(np.isnan(yaw), vertical)
-    assert yaw[~vertical] == pytest.approx(flown_yaw[~vertical], abs=1e-9)
-
-
-@pytest.mark.parametrize("env_id", [CUTOFF, LEO])
-def test_orbit_figure_shows_orbits_insertion_and_ground_track(flown, env_id):
-    metrics, arrays = flown[env_id]
-    figure = figure_of("orbit.png", arrays, metrics)
-    plane, insertion, ground = figure.axes
-    lines, target, y = lines_of(plane), TARGETS[env_id], arrays["y"]
-    frame, (a, e) = target_frame(target), (target["a_km"] / 1e3, target["e"])
-    drawn = lines["target orbit"]
+def test_orbit_figure_shows_orbits_insertion_and_ground_track(flown):
+    metrics, arrays = flown[CUTOFF]
+    plane, insertion, ground = figure_of("orbit.png", arrays, metrics).axes
+    lines, y, frame = lines_of(plane), arrays["y"], target_frame(PAPER)
+    a, e, drawn = PAPER["a_km"] / 1e3, PAPER["e"], lines["target orbit"]
     assert drawn[:, 0].max() == pytest.approx(a * (1 - e)) and np.ptp(drawn[:, 0]) == pytest.approx(2 * a)
     assert np.ptp(drawn[:, 1]) == pytest.approx(2 * a * math.sqrt(1 - e**2), rel=1e-5)
-    (west, east), (south, north) = plane.get_xlim(), plane.get_ylim()
-    low, high = drawn.min(axis=0), drawn.max(axis=0)
-    earth = RE / 1e6
-    assert west < min(low[0], -earth) and east > max(high[0], earth), "both are drawn whole"
-    assert south < min(low[1], -earth) and north > max(high[1], earth)
     assert lines["policy"] == pytest.approx((y[:, :3] @ frame[:2].T) / 1e6)
-    for r in target_points(envs.ROCKETS[env_id].rocket):  # the conic's equation: r = p - e x
-        assert norm(r) == pytest.approx(1e3 * a * (1 - e**2) - e * (r @ frame[0]))
     distance = np.hypot(*(lines["orbit reached"] - lines["policy"][-1]).T)
     assert distance.min() < 0.02  # 1000 km: it passes through the last state
     angle = math.degrees(math.atan2(*lines["policy"][-1][::-1]))
     circle = [line.get_xydata()[0] for line in insertion.lines if line.get_marker() == "o"][0]
     assert circle == pytest.approx([angle, (norm(y[-1, :3]) - RE) / 1e3])
-    top = max((norm(row[:3]) - RE) / 1e3 for row in y)
-    (west, east), (low, high) = insertion.get_xlim(), insertion.get_ylim()
-    assert west < angle < east and low < 0 and high > max(top, 250 if env_id == CUTOFF else 0)
     longitude = [math.degrees(math.atan2(row[1], row[0]) - 7.29211585e-5 * t) for row, t in zip(y, arrays["t"])]
     latitude = [math.degrees(math.asin(row[2] / norm(row[:3]))) for row in y]
     red = next(line for line in ground.lines if line.get_color() == "tab:red")
     assert red.get_xydata() == pytest.approx(np.c_[longitude, latitude])
-    assert red.get_xydata()[0] == pytest.approx([0, 28.5], abs=1e-9)
     plane_at_launch = lines_of(ground)["target plane at launch"]
     assert np.hypot(*(plane_at_launch - [0, 28.5]).T).min() < 0.5  # the launch site is in it, nearly
-    assert all(ax.get_xlabel() and ax.get_ylabel() and ax.get_title() for ax in figure.axes)
 
 
 def curve(level=0.0, evaluations=True):
@@ -524,88 +424,22 @@ def curve(level=0.0, evaluations=True):
     return drawn | unpriced | {"eval/error_norm": (steps[9::10], 0.5 * 0.5 ** update[:4])}
 
 
-def test_training_figure_shows_the_error_and_no_outlier(flown):
-    metrics, arrays = flown[CUTOFF]
-    figure = figure_of("training.png", arrays, metrics, [curve(), curve(-1.0)])
-    returns, policy_loss, total_loss, error = figure.axes
-    assert error.get_yscale() == "log" and 0.02 in [line.get_ydata()[0] for line in error.lines]
-    assert "error" in error.get_ylabel()
-    low, high = total_loss.get_ylim()
-    assert 0.8 < low < 0.9 and 1.1 < high < 1.2 and "1e+04" in total_loss.get_title()
-    assert policy_loss.get_title() == "" and policy_loss.get_ylim()[1] > 0.0099
-    blue = [line for line in returns.lines if line.get_color() == "tab:blue"][0]
-    assert blue.get_ydata()[0] == metrics["reference_episodic_return"]
-    last_returns = [line.get_ydata()[-1] for line in returns.lines]
-    assert max(last_returns) > 26, "the evaluations' return, not the training's 20, which has its noise"
-    assert len(figure_of("training.png", arrays, metrics, [curve(evaluations=False)]).axes) == 3
-
-
-def test_crash_can_be_drawn(crashed):
-    metrics, arrays = crashed
-    for figure in (figure_of("trajectory.png", arrays, metrics), figure_of("orbit.png", arrays, metrics)):
-        assert "crashed" in figure.get_suptitle()
-
-
 # ---------------------------------------------------------------------------------------------------------------------
 # Results folders
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def make_run(folder, flight, seed=1, level=0.0, **changes):
-    """A synthetic run folder: events, checkpoint, eval.json, eval.npz; returns it."""
-    from torch.utils.tensorboard import SummaryWriter
-
-    folder.mkdir(parents=True)
-    with SummaryWriter(folder) as writer:
-        for tag, (steps, values) in curve(level).items():
-            for step, value in zip(steps, values):
-                writer.add_scalar(tag, value, step)
-    (folder / "agent.safetensors").write_bytes(b"weights of seed %d" % seed)
-    digest = hashlib.sha256((folder / "agent.safetensors").read_bytes()).hexdigest()
-    metrics, arrays = flight
-    write_json(folder / "eval.json", {**metrics, "seed": seed, "checkpoint_sha256": digest, **changes})
-    write_npz(folder / "eval.npz", arrays)
-    return folder
-
-
 @pytest.mark.slow
-def test_publish_and_figures(flown, tmp_path, monkeypatch, capsys):
-    first = make_run(tmp_path / "a", flown[CUTOFF])
-    second = make_run(tmp_path / "b", flown[CUTOFF], seed=2, error_norm=0.5, final_mass_kg=6000.0, mass_ratio=0.8)
-    results = tmp_path / "results" / "rocket_cutoff"
-    monkeypatch.setattr(animation, "FRAMES", 3)
-    printed = command_line(monkeypatch, capsys, "publish", first, results)
-    assert printed.startswith(CUTOFF) and "eccentricity" in printed and "seed 1" not in printed
-    files = snapshot(results)
-    names = {"agent.safetensors", "eval.json", "eval.npz", "seeds/1.json", "seeds/1.csv"}
-    names |= {f"figures/{name}.png" for name in ("training", "trajectory", "orbit")} | {"figures/animation.gif"}
-    assert {str(name) for name in files} == names
-    for name, content in files.items():
-        if name.suffix == ".png":
-            assert content.startswith(b"\x89PNG") and len(content) > 40_000, "an empty picture is smaller"
-    command_line(monkeypatch, capsys, "publish", second, results)
-    monkeypatch.setattr(evaluate, "redraw", lambda folder: [folder / "figures" / "orbit.png"])  # drawn above
-    printed = command_line(monkeypatch, capsys, "figures", results)
-    error, mass = (flown[CUTOFF][0][key] for key in ("error_norm", "final_mass_kg"))
-    rows = {line[:40].strip(): line[40:].split() for line in printed.splitlines()}
-    assert rows[""][-7:] == ["seed", "1", "seed", "2", "median", "lowest", "highest"]
+def test_figures_and_rows_of_a_results_folder(flown, tmp_path):
+    metrics, arrays = flown[CUTOFF]
+    steps = np.arange(1, 41)
+    curve = {tag: (steps, 0.9**steps) for tag in ("charts/episodic_return", "losses/total_loss", "eval/error_norm")}
+    drawn = evaluate.draw_figures(tmp_path, arrays, metrics, [curve])
+    assert {path.name for path in drawn} == {"training.png", "trajectory.png", "orbit.png"}
+    (tmp_path / "seeds").mkdir()
+    for seed, error in ((1, metrics["error_norm"]), (2, 0.5)):
+        write_json(tmp_path / "seeds" / f"{seed}.json", metrics | {"seed": seed, "error_norm": error})
+    rows = {line[:40].strip(): line[40:].split() for line in evaluate.seed_lines(tmp_path)}
+    error = metrics["error_norm"]
     found = [float(cell) for cell in rows["||error||"]]
     assert found == pytest.approx([error, 0.5, (error + 0.5) / 2, error, 0.5], abs=1e-6)
-    assert rows["final mass (kg)"] == [f"{x:.2f}" for x in (mass, 6000, (mass + 6000) / 2, 6000, mass)]
-
-
-def test_refused_publishing(flown, tmp_path, monkeypatch, capsys):
-    for name in ("redraw", "animate"):
-        monkeypatch.setattr(evaluate, name, lambda folder: [])
-    results = tmp_path / "results"
-    command_line(monkeypatch, capsys, "publish", make_run(tmp_path / "good", flown[CUTOFF]), results)
-    before = snapshot(results)
-    metrics, arrays = flown[CUTOFF]
-    bad = {"y_reference": make_run(tmp_path / "lacks", (metrics, {k: arrays[k] for k in ARRAYS - {"y_reference"}}), 2)}
-    bad |= {FIXED: make_run(tmp_path / "other id", flown[FIXED], 2)}
-    bad |= {"it must be one of": make_run(tmp_path / "unknown", flown[CUTOFF], 2, env_id="RocketAscent-v9")}
-    for message, run in bad.items():
-        with pytest.raises(SystemExit) as refusal:
-            command_line(monkeypatch, capsys, "publish", run, results)
-        assert message in str(refusal.value) and "\n" not in str(refusal.value)
-        assert snapshot(results) == before

@@ -14,8 +14,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import spiceypy
-from helpers import figure_of, table_of
-from matplotlib.backends.backend_agg import FigureCanvasAgg
+from helpers import table_of
 from rocket_oracle import CUTOFF, FIXED, LEO, MU, RE, single_burn
 
 import baselines
@@ -62,17 +61,13 @@ def two_stages(first=FIRST, second=SECOND, number=1, dropped=1, end=162.0, last=
 
 REFUSED = {
     "end_time is 556": lambda: replace(TWO, end_time=556.0),
-    "end_time is 0": lambda: replace(TWO, end_time=0.0),
     "propellant of burns[0].engines, 411000.0 kg each, is 411000 kg in all": lambda: two_stages(end=163.0, last=556.0),
-    "propellant of burns[1].engines": lambda: two_stages(last=556.0),
     "propellant of burns[0].engines": lambda: two_stages(replace(FIRST, isp=305.0), table_isp=True),
     "it must be dropped by this burn or a later one, or burn in the last": lambda: two_stages(dropped=0),
     "it must be empty: the last burn's engines stay aboard": lambda: replace(
         TWO, burns=(TWO.burns[0], replace(TWO.burns[1], dropped=((1, SECOND),)))
     ),
     "a mission's ceiling_km is nan; it must be positive": lambda: envs.Mission(two_stages(), ceiling_km=np.nan),
-    "a mission's mass_unit is -5; it must be positive": lambda: envs.Mission(two_stages(), mass_unit=-5),
-    "a mission's guided_until is 0; it must be positive": lambda: envs.Mission(two_stages(), guided_until=0),
     "a mission's floor_from is None; it must be a finite": lambda: envs.Mission(two_stages(), floor_from=None),
     "a burn's engines is (1, Engine(": lambda: Burn(162.0, (1, FIRST)),
     "a burn's dropped is ": lambda: Burn(162.0, ((1, FIRST),), dropped=[(1, FIRST)]),
@@ -80,46 +75,26 @@ REFUSED = {
     "number of an engine in burns[0].engines is 7; it must be positive and at most 6": lambda: replace(
         ROCKET, burns=(Burn(75.2, ((7, BOOSTER),), ((6, BOOSTER),)), *ROCKET.burns[2:])
     ),
-    "number of an engine in burns[0].engines is -1": lambda: two_stages(number=-1),
     "thrust of burns[0] is 5.5e+06 N; it must be above the weight at lift-off": lambda: two_stages(
         replace(FIRST, thrust=5.5e6, isp=221.1)
     ),
     "burns[1].end is 100.0": lambda: replace(TWO, burns=(TWO.burns[0], Burn(100.0, ((1, SECOND),)))),
-    "burns[1].end is nan": lambda: replace(TWO, burns=(TWO.burns[0], Burn(math.nan, ((1, SECOND),)))),
-    "burns[0].end is -1": lambda: replace(TWO, burns=(replace(TWO.burns[0], end=-1.0), TWO.burns[1])),
     "burns[1].engines is ()": lambda: replace(TWO, burns=(TWO.burns[0], Burn(555.0, ()))),
-    "number of an engine in burns[0].dropped is -3; it must be positive": lambda: replace(
-        ROCKET, burns=(replace(ROCKET.burns[0], dropped=((6, BOOSTER), (-3, SECOND))), *ROCKET.burns[1:])
-    ),
-    "a burn's end is '162'": lambda: Burn("162", ((1, FIRST),)),
-    "a burn's dropped is (('1', Engine(": lambda: Burn(162.0, ((1, FIRST),), dropped=(("1", FIRST),)),
-    "burns[1] is 555.0; it must be a Burn": lambda: replace(TWO, burns=(TWO.burns[0], 555.0)),
     "burns is ()": lambda: replace(TWO, burns=()),
-    "burns is [Burn": lambda: replace(TWO, burns=list(TWO.burns)),
     "payload is nan": lambda: replace(TWO, payload=math.nan),
     "payload is -1": lambda: replace(TWO, payload=-1.0),
-    "payload is heavy": lambda: replace(TWO, payload="heavy"),
-    "a is inf": lambda: replace(TWO, a=math.inf),
-    "a is -7": lambda: replace(TWO, a=-7e6),
     "e is 1.0": lambda: replace(TWO, e=1.0),
-    "e is -0.1": lambda: replace(TWO, e=-0.1),
     "i is 181": lambda: replace(TWO, i=181.0),
     "raan is None; it must be a number: all five elements are given": lambda: replace(TWO, raan=None),
-    "a rocket's a is 400000.0 m with e 0.0, -5978.1 km by -5978.1 km; it must": lambda: replace(TWO, a=400e3),
     "a rocket's a is 6778145.0 m with e 0.5, -2989.1 km by 3789.1 km; it must": lambda: replace(TWO, e=0.5),
     "an engine's name is 7; it must be a string": lambda: replace(FIRST, name=7),
     "burns[0].engines is (); it must hold an engine: only a burn between others may be a coast": lambda: replace(
         TWO, burns=(Burn(10.0, ()), *TWO.burns)
     ),
-    "raan is nan": lambda: replace(TWO, raan=math.nan),
     "latitude is 90": lambda: replace(TWO, latitude=90.0),
     "dt is 0": lambda: replace(TWO, dt=0.0),
-    "S is -1": lambda: replace(TWO, S=-1.0),
     "engine's thrust is nan": lambda: replace(FIRST, thrust=math.nan),
-    "engine's thrust is -1": lambda: replace(FIRST, thrust=-1.0),
     "engine's isp is 0": lambda: replace(FIRST, isp=0.0),
-    "engine's burn_time is 0": lambda: replace(FIRST, burn_time=0.0),
-    "engine's total_mass is 0": lambda: replace(FIRST, total_mass=0.0),
     "engine's propellant is 434000": lambda: replace(FIRST, propellant=434e3),
     "engine's propellant is 0.0; it must be positive where it has thrust": lambda: replace(FIRST, propellant=0.0),
 }
@@ -271,16 +246,6 @@ def test_engines_that_share_a_tank_never_burn_what_was_dropped(first, later):
     register_rocket("Shared-v0", rocket)
     with pytest.raises(BadInput, match="cannot be drawn"):
         gym.make_vec("Shared-v0", num_envs=1, dispersion=1.0)
-
-
-def test_a_core_that_burnt_before_runs_dry_by_the_table_too():
-    """`table_isp`: beside two boosters and then alone, and never below its dry mass."""
-    core = Engine(total_mass=433e3, propellant=411e3, thrust=4e6, isp=300.0, burn_time=400.0)
-    burns = (Burn(100.0, ((1, core), (2, FIRST)), ((2, FIRST),)), Burn(400.0, ((1, core),)))
-    rocket = replace(TWO, burns=burns, end_time=400.0, table_isp=True)
-    flow = 4e6 / (9.80665 * 300.0)
-    *_, last, coast = rocket.arcs()
-    assert last[1] == pytest.approx(411e3 / flow) and coast[2] == coast[3] == 0.0
 
 
 def test_plane_below_the_launch_latitude_is_a_warning():
@@ -442,66 +407,6 @@ def test_a_rocket_of_your_own_from_reference_to_figures(solved, env_id, tmp_path
     assert [path.name for path in paths] == ["trajectory.png", "orbit.png"] and all(path.exists() for path in paths)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("env_id", OWN)
-def test_figures_of_a_rocket_of_your_own(solved, env_id):
-    """Labels inside their panel, the whole target orbit, the launch site in its plane, a ceiling where there is one."""
-    metrics, arrays, mission = solved[env_id]
-    rocket = mission.rocket
-    register_rocket(env_id, rocket, mission.cutoff, mission.ceiling_km)
-    figure = figure_of("trajectory.png", arrays, metrics)
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    panel = next(ax for ax in figure.axes if "mass" in ax.get_ylabel())
-    assert len(panel.texts) == len(rocket.burns) - 1
-    for text in panel.texts:
-        inner, outer = text.get_window_extent(canvas.get_renderer()), panel.get_window_extent()
-        assert outer.x0 <= inner.x0 and inner.x1 <= outer.x1 and outer.y0 <= inner.y0 and inner.y1 <= outer.y1
-    altitude = next(ax for ax in figure.axes if "altitude" in ax.get_ylabel())
-    level = [line.get_ydata()[0] for line in altitude.lines if line.get_color() == "tab:green"]
-    assert level == ([400.0] if env_id == "ThreeBurns-v0" else [])
-    plane, _, ground = figure_of("orbit.png", arrays, metrics).axes
-    target = next(line.get_xydata() for line in plane.lines if line.get_label() == "target orbit")
-    lows, highs = np.array([plane.get_xlim(), plane.get_ylim()]).T
-    assert (lows < target.min(axis=0)).all() and (highs > target.max(axis=0)).all()
-    site = next(line.get_xydata() for line in ground.lines if line.get_label() == "target plane at launch")
-    assert np.hypot(*(site - [0, rocket.latitude]).T).min() < 0.5
-
-
-def stub(env_id, rocket):
-    """Metrics and arrays of a flight of a rocket registered here, as its own reference."""
-    register_rocket(env_id, rocket)
-    flight = envs.fly_rocket(env_id, lambda obs, t: np.array([[1.0, 0.2, 0.0]]), action_frame="local")
-    reference = flight | {"reference_mass_kg": 1.0, "reference_time_s": 1.0, "nine_pitch_error_norm": 1.0}
-    metrics = {"env_id": env_id} | rocket_metrics(flight, reference, ROCKETS[env_id])
-    return metrics, {f"{key}{side}": flight[key] for key in "tuy" for side in ("", "_reference")}
-
-
-def test_late_staging_labels_stay_inside():
-    """A last stage of 20 s: its label stands to the left of the line."""
-    last = replace(SECOND, burn_time=20.0, propellant=5e3)
-    rocket = replace(TWO, burns=(TWO.burns[0], Burn(182.0, ((1, last),))), end_time=182.0)
-    metrics, arrays = stub("Late-v0", rocket)
-    figure = figure_of("trajectory.png", arrays, metrics)
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    panel = next(ax for ax in figure.axes if "mass" in ax.get_ylabel())
-    (text,) = panel.texts
-    inner, outer = text.get_window_extent(canvas.get_renderer()), panel.get_window_extent()
-    assert outer.x0 <= inner.x0 and inner.x1 <= outer.x1 and "162 s: 22.00 t dropped" in text.get_text()
-
-
-@pytest.mark.parametrize("a, e", [(4.2e7, 0.0), (3e7, 0.5), (6.6e6, 0.0)])
-def test_orbit_figure_holds_the_whole_target_orbit(a, e):
-    """Also where its perigee is far above the Earth."""
-    metrics, arrays = stub("High-v0", replace(TWO, a=a, e=e))
-    plane = figure_of("orbit.png", arrays, metrics).axes[0]
-    (west, east), (south, north) = plane.get_xlim(), plane.get_ylim()
-    b = a * math.sqrt(1 - e * e) / 1e6
-    assert west < -a * (1 + e) / 1e6 and east > a * (1 - e) / 1e6 and south < -b and north > b
-    assert west < -RE / 1e6 and east > RE / 1e6
-
-
 # --- evaluation against the rocket that flies -------------------------------------------------------------------------
 
 
@@ -580,7 +485,3 @@ def test_mass_for_an_equatorial_orbit_reached_is_of_its_perigee(monkeypatch):
             with pytest.raises(ZeroDivisionError):
                 task_of("Equatorial-v0").reported_metrics(metrics)
             assert asked[0]["argp_deg"] == pytest.approx(100.0) and asked[0]["raan_deg"] == 300.0
-
-
-def test_the_tests_leave_nothing_registered():
-    assert not {"Single-v0", "ThreeBurns-v0", "Again-v0"} & gym.registry.keys()
