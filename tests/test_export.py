@@ -380,3 +380,10 @@ def test_another_planets_rocket_is_no_track():
     mission = SimpleNamespace(rocket=SimpleNamespace(mu=4.28e13, body="ground"))
     with pytest.raises(BadInput, match="mu of Mars-v0 is 42800000000000.0; it must be the Earth's"):
         offer(RocketTask("Mars-v0", mission), "track")({})
+
+
+def test_a_family_without_exports_is_one_line():
+    task = SimpleNamespace(env_id="Mine-v0")  # of a folder that `exports/` does not know
+    for name in ("interface", "step_columns", "flight_columns", "track", "page"):
+        with pytest.raises(BadInput, match="^the env_id is Mine-v0; "):
+            offer(task, name)
