@@ -1,6 +1,6 @@
 """Damaged files, absurd flags and actions: each works or gives one line.
 
-`benchmarks/robustness.py` tries ten times as many.
+`benchmarks.robustness` tries ten times as many.
 """
 
 import importlib
