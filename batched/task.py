@@ -6,11 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from batched import export
 from common.batch import make_batch
 from common.errors import BadInput
 from common.flying import fly_until_ended
-from common.tasks import Interface, SampledTask
+from common.tasks import SampledTask
 
 KEPT_FLIGHTS = 30  # in a results folder
 SHOWN_FLIGHTS = 10  # in a figure
@@ -105,17 +104,6 @@ class BatchedTask(SampledTask):
         """Of the first `KEPT_FLIGHTS`; all arrays but the times are by episode."""
         return {key: array if key == "t" else array[:KEPT_FLIGHTS] for key, array in arrays.items()}
 
-    # --- what is taken along
-
-    def interface(self, **env_options) -> Interface:
-        return export.interface(self.env_id, **env_options)
-
-    def step_columns(self, arrays: dict, launch_longitude: float) -> dict:
-        return export.step_columns(arrays)
-
-    def flight_columns(self, arrays: dict, metrics: dict) -> dict:
-        return export.flight_columns(arrays)
-
     # --- commands
 
     def speed_cases(self) -> list[tuple[str, dict, list | None]]:
@@ -128,6 +116,3 @@ class BatchedTask(SampledTask):
         raise BadInput(
             f"env_id is {self.env_id!r}, without an optimum; it must be a table (`envs.Problem`) or a rocket"
         )
-
-    def fly_opponents(self, folder, **options) -> None:
-        raise BadInput(f"the env_id of {folder} is {self.env_id}; it must be a rocket's with cut-off or a lander's")

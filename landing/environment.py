@@ -1,4 +1,4 @@
-"""The landers' environment: N descents in closed form with exact touchdowns, and how an id is registered."""
+"""The landers' environment: N descents in closed form with exact touchdowns."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.envs.registration import ENV_ID_RE
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
 
@@ -383,22 +382,6 @@ def make_lander(env_id: str, **options) -> LanderEnv:
 
 
 make_lander.metadata = RENDERED  # gym.make looks here before there is an environment
-
-
-def register_lander(env_id: str, lander: Lander):
-    """Register a lander as an environment id, which `ppo_gtrxl_lander.py`, evaluations and references then take, too.
-
-    Raises BadInput if the id is taken or not in Gymnasium's form.
-    """
-    taken = env_id in gym.registry or not ENV_ID_RE.fullmatch(env_id) or "/" in env_id
-    refuse_unless(not taken, "env_id", repr(env_id), "must be a new id such as MyLander-v0")
-    gym.register(
-        id=env_id,
-        entry_point="envs:make_lander",
-        vector_entry_point="envs:make_lander_vector",
-        kwargs={"env_id": env_id},
-    )
-    LANDERS[env_id] = lander
 
 
 def fly_lander(env_id: str, policy: Callable, draw: np.ndarray, decision_s: float = PERIOD, **options) -> dict:

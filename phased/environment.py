@@ -445,22 +445,6 @@ def make_phased(env_id: str, **options) -> PhasedEnv:
     return PhasedEnv(make_phased_vector(env_id, **options)).sealed()
 
 
-def register_problem(problem: Problem):
-    """Make a table known to `gymnasium.make`, to the scripts and to `baselines.py`, under its `env_id`.
-
-    Raises BadInput if the id is taken.
-    """
-    taken = problem.env_id in PROBLEMS or problem.env_id in gym.registry
-    refuse_unless(not taken, "env_id", repr(problem.env_id), "is taken already; it must be an id of its own")
-    PROBLEMS[problem.env_id] = problem
-    gym.register(
-        id=problem.env_id,
-        entry_point="envs:make_phased",
-        vector_entry_point="envs:make_phased_vector",
-        kwargs={"env_id": problem.env_id},
-    )
-
-
 def fly(env_id: str, policy: Callable, x0, draw=None, **options) -> dict:
     """Fly `policy(obs (n, obs), t) -> action (n, m)` from each start x0 (n, states), and record the flights.
 

@@ -1,19 +1,17 @@
-"""The rockets' environment, and how an id is registered.
+"""The rockets' environment.
 
-Reading order: the batched environment (draws, observations, step, reward), the single environment, one recorded flight,
-registration. `flight.py` has the flight within a step.
+Reading order: the batched environment (draws, observations, step, reward), the single environment, one recorded flight.
+`flight.py` has the flight within a step.
 """
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.envs.registration import ENV_ID_RE
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
 
@@ -586,32 +584,3 @@ def fly_rocket(
 
 
 make_rocket.metadata = RENDERED  # gym.make looks here before there is an environment
-
-
-def register_rocket(env_id: str, rocket: Rocket, cutoff: bool = False, ceiling_km: float | None = None, **rules):
-    """Register a rocket as an environment id, which `ppo_gtrxl_rocket.py`, evaluations and references then take, too.
-
-    `cutoff`, `ceiling_km` and `rules` are the fields of `Mission`. An id that is registered already is replaced. A
-    warning says so if it was another rocket's. Raises BadInput if the id is another environment's or not in Gymnasium's
-    form.
-    """
-    others = gym.registry.keys() - ROCKETS.keys()
-    if env_id in others or not ENV_ID_RE.fullmatch(env_id) or "/" in env_id:
-        raise BadInput(f"env_id is {env_id!r}; it must be a new id such as MyRocket-v0")
-    names = [field.name for field in fields(Mission)]
-    for name in rules.keys() - set(names):
-        raise BadInput(f"register_rocket has no keyword {name!r}; it must be one of {', '.join(names)}")
-    mission = Mission(rocket, cutoff, ceiling_km, **rules)
-    if ROCKETS.get(env_id, mission) != mission:
-        warnings.warn(f"{env_id} was another rocket's id; from here on it is this one's", stacklevel=2)
-    gym.registry.pop(env_id, None)
-    try:
-        gym.register(
-            id=env_id,
-            entry_point="envs:make_rocket",
-            vector_entry_point="envs:make_rocket_vector",
-            kwargs={"env_id": env_id},
-        )
-    except gym.error.Error as error:  # the name of another environment without its version
-        raise BadInput(f"env_id is {env_id!r}; it must be a new id such as MyRocket-v0: {error}") from error
-    ROCKETS[env_id] = mission
