@@ -6,9 +6,9 @@
     python ppo_gtrxl_di.py --eval-only --checkpoint results/di/agent.safetensors
 
 Reading order: arguments, recipes, problem, Gated Transformer-XL, agent, PPO, what we add to PPO, training, main.
-From the first section "Shared" on, all ppo_gtrxl_*.py are the same to the letter. A section with "ours" in its heading
-contains nothing from the paper. In the other sections a comment marks what is ours. "Line 8" means line 8 of
-Algorithm 1, "Eq. (7)" the seventh numbered equation of the paper.
+From the first section "Shared" on, all ppo_gtrxl_*.py are the same but for lines that end with "# this problem". A
+section with "ours" in its heading contains nothing from the paper. In the other sections a comment marks what is ours.
+"Line 8" means line 8 of Algorithm 1, "Eq. (7)" the seventh numbered equation of the paper.
 
 T is the number of steps, N of environments, H of heads. L is the memory length, d the width, and dk = d / H.
 Algorithm 1 writes E for our N, and N for its iterations.
@@ -33,7 +33,8 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 import runs
 from common.tasks import ForEachId
 from cuda_graphs import speed_up
-from runs import Schedule, all_reduce_sum
+from envs import PROBLEMS
+from runs import Schedule
 
 
 @dataclass
@@ -181,8 +182,8 @@ def describe(episodes, metrics):
 BONUS_WIDTH = 0.4
 
 
-def set_curriculum(envs, args, progress):
-    """Set what only training changes. Returns how many flights in a row have the same start.
+def curriculum(args, progress):
+    """What this update hands over to the environments, by name (`PhasedTraining` of phased/environment.py).
 
     At first every flight has its own start. Later several flights share a start and are compared.
 
@@ -193,19 +194,12 @@ def set_curriculum(envs, args, progress):
     the cost.
     """
     group = round(value_at(args.flights_per_start, progress))
-    envs.flights_per_start = group
-    if envs.has_circles:
-        envs.radius_scale = math.exp(value_at(args.log_radius, progress))
-        envs.bonus_width = BONUS_WIDTH if group > 1 else 0.0
-    return group
-
-
-def add_rewards(envs, args, progress, batch, episodes):
-    """Does nothing here. Training is paid what the environment pays; the rocket's script adds to it."""
-
-
-def before_training(agent, args, env_options):
-    """Does nothing here. The rocket's script prepares its agent for vehicles that differ."""
+    training = {"flights_per_start": group}
+    problem = PROBLEMS.get(args.env_id)
+    if problem and problem.circles_count:
+        training["radius_scale"] = math.exp(value_at(args.log_radius, progress))
+        training["bonus_width"] = BONUS_WIDTH if group > 1 else 0.0
+    return training
 
 
 # Shared: Gated Transformer-XL ("Gated Transformer-XL Implementation") -------------------------------------------------
@@ -315,11 +309,20 @@ class RelativeAttention(nn.Module):
         """
         kv, projections, R = cache
         L = self.memory_length
+        q, kv_of_step = self.project(x, projections)
+        kv[:, :, :, t + L : t + L + 1] = kv_of_step
+        return self.attend(q, kv[:, :, :, t : t + L + 1], R)
+
+    def project(self, x, projections):
+        """One step's query (N, H, 1, dk), and its key and value (2, N, H, 1, dk), of x (N, d)."""
         qkv = F.linear(x, projections)  # (N, 3 d)
-        qkv = qkv.view(len(x), 3, self.num_heads, 1, self.dk).transpose(0, 1)  # (3, N, H, 1, dk)
-        kv[:, :, :, t + L : t + L + 1] = qkv[1:]
-        k, v = kv[:, :, :, t : t + L + 1]  # (N, H, L + 1, dk)
-        scores = qkv[0] @ (k + R).transpose(-1, -2)  # (N, H, 1, L + 1)
+        qkv = qkv.view(-1, 3, self.num_heads, 1, self.dk).transpose(0, 1)  # (3, N, H, 1, dk)
+        return qkv[0], qkv[1:]
+
+    def attend(self, q, window, R):
+        """MultiHead(x) (N, d) of one step, from its query and the window's keys and values (2, N, H, L + 1, dk)."""
+        k, v = window  # (N, H, L + 1, dk)
+        scores = q @ (k + R).transpose(-1, -2)  # (N, H, 1, L + 1)
         attended = scores.softmax(dim=-1) @ v  # (N, H, 1, dk)
         return self.out(attended.flatten(1))
 
@@ -465,11 +468,12 @@ class Batch:
 
 
 @torch.no_grad()
-def rollout(agent, envs, reward_scale, memory_noise):
-    """Fly one episode in each environment (lines 3-13).
+def rollout(agent, envs, training, reward_scale, memory_noise):
+    """Fly one episode in each environment (lines 3-13). `training` is what `curriculum` hands over to them.
 
-    Returns this process's Batch, and {key: (episodes, ...)} of `final_info` for the episodes of all processes.
+    Returns the Batch, and {key: (N, ...)}, the `final_info` of its episodes.
     """
+    next_obs, _ = envs.reset(options={"training": training})
     T, N = envs.episode_steps, envs.num_envs
     zeros = agent.actor_logstd.new_zeros  # on the agent's device, in its precision
     batch = Batch(
@@ -487,7 +491,6 @@ def rollout(agent, envs, reward_scale, memory_noise):
     alive_at = np.zeros((T, N))
     alive = np.ones(N, dtype=bool)
     episodes = {}  # `final_info` of each environment's first episode
-    next_obs, _ = envs.reset()
     batch.obs[:] = torch.as_tensor(next_obs)  # no step stays zero: the features of zeros could be NaN
 
     for t in range(T):  # line 6
@@ -509,9 +512,7 @@ def rollout(agent, envs, reward_scale, memory_noise):
     batch.alive[:] = torch.as_tensor(alive_at)
     # v_t of line 8 and log pi(a_t). Sampling needs neither, so one call computes them for all steps.
     batch.logprobs, _, batch.critic = agent.evaluate_actions(hidden, batch.actions)
-    of_each_process = runs.all_gather(episodes)
-    all_episodes = {key: np.concatenate([part[key] for part in of_each_process]) for key in episodes}
-    return batch, all_episodes
+    return batch, episodes
 
 
 def gae(rewards, values, alive, gamma, gae_lambda):
@@ -533,10 +534,10 @@ def gae(rewards, values, alive, gamma, gae_lambda):
 
 
 def moments(x, alive, dim):
-    """Mean and variance of x (T, N, ...) along dim, over the living steps of all processes. dim is kept as 1."""
-    count = all_reduce_sum(alive.sum(dim, keepdim=True)).clamp(min=1)
-    mean = all_reduce_sum((x * alive).sum(dim, keepdim=True)) / count
-    variance = all_reduce_sum(((x - mean) ** 2 * alive).sum(dim, keepdim=True)) / count
+    """Mean and variance of x (T, N, ...) along dim, over the living steps. dim is kept as 1."""
+    count = runs.total(alive.sum(dim, keepdim=True)).clamp(min=1)
+    mean = runs.total((x * alive).sum(dim, keepdim=True)) / count
+    variance = runs.total(((x - mean) ** 2 * alive).sum(dim, keepdim=True)) / count
     return mean, variance
 
 
@@ -551,12 +552,12 @@ def ppo_loss(agent, batch, mb, clip_coef, vf_coef, ent_coef):
     """The loss -L_CLIP + c1 L_VF - c2 H over the living steps of the episodes `mb`, and the means that are logged.
 
     L_CLIP is Eq. (11). Line 18 prints L_CLIP + c1 L_VF - c2 H. Our sign of L_CLIP raises it where the loss is
-    minimised. L_VF is 1/2 (critic - target)^2. Under torchrun the loss is this process's part of the mean, and
-    `ppo_gradient` sums the gradients. What is logged is the mean over all processes.
+    minimised. L_VF is 1/2 (critic - target)^2. With several processes `runs.total` sums over them: the loss is this
+    process's part of the mean, and what is logged is the whole mean.
     """
     alive = batch.alive[:, mb]
     advantages = batch.advantages[:, mb]
-    steps = all_reduce_sum(alive.sum())
+    steps = runs.total(alive.sum())
 
     def mean(x):
         return (x * alive).sum() / steps
@@ -581,8 +582,8 @@ def ppo_loss(agent, batch, mb, clip_coef, vf_coef, ent_coef):
         losses["old_approx_kl"] = mean(-logratio)
         losses["approx_kl"] = mean((ratio - 1) - logratio)
         losses["clipfrac"] = mean(((ratio - 1.0).abs() > clip_coef).to(ratio.dtype))
-    of_all_processes = all_reduce_sum(torch.stack([value.detach() for value in losses.values()]))
-    return loss, dict(zip(losses, of_all_processes))
+    means = runs.total(torch.stack([value.detach() for value in losses.values()]))
+    return loss, dict(zip(losses, means))
 
 
 def ppo_gradient(args, agent, batch, mb, ent_coef):
@@ -593,7 +594,7 @@ def ppo_gradient(args, agent, batch, mb, ent_coef):
     loss, losses = ppo_loss(agent, batch, mb, args.clip_coef, args.vf_coef, ent_coef)
     agent.zero_grad()
     loss.backward()
-    runs.sum_gradients(agent)  # over the processes of torchrun
+    runs.total([weight.grad for weight in agent.parameters() if weight.grad is not None])  # of all processes
     losses["gradient_norm"] = nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
     return losses
 
@@ -665,6 +666,9 @@ def linear_fit(x, y, alive):
     return fitted[..., 0].to(alive.dtype)
 
 
+SMALLEST_SPREAD = 0.3  # of the mean spread; a step of almost no spread would be divided by almost 0
+
+
 def returns_baseline(batch, gamma, group):
     """The baseline (T, N) and the scale (T, 1) of the value V(s_t) = baseline_t + scale_t * critic(s_t).
 
@@ -673,8 +677,7 @@ def returns_baseline(batch, gamma, group):
 
     Each `group` of neighbouring episodes flew the same start. Their returns from step t on are regressed linearly on
     their observations at step t. The fit is the baseline. Its residuals have a spread at each step, over all flights of
-    all groups. scale^2 is the spread^2 of the step plus (0.3 x the mean spread of the steps)^2. Without the second term
-    a step of almost no spread would be divided by almost 0.
+    all groups. scale^2 is the spread^2 of the step plus (SMALLEST_SPREAD x the mean spread of the steps)^2.
 
     RLOO (Kool et al. 2019) takes the mean return of the other samples of a question as the baseline. GRPO (Shao et al.
     2024) takes the mean return of the whole group, and divides by the group's spread. Both have one return for each
@@ -690,7 +693,7 @@ def returns_baseline(batch, gamma, group):
     baseline = linear_fit(obs, grouped_returns, alive).flatten(1)
     _, variance = moments(monte_carlo - baseline, batch.alive, 1)
     mean_spread = variance.sqrt().mean()  # steps that no flight reaches count as zeros
-    scale = (variance + (0.3 * mean_spread) ** 2 + 1e-8).sqrt()
+    scale = (variance + (SMALLEST_SPREAD * mean_spread) ** 2 + 1e-8).sqrt()
     return baseline, scale
 
 
@@ -718,13 +721,13 @@ def train(args, agent, average, optimizer, envs, run, gradient=ppo_gradient):
         set_log_std(agent, args, progress)
         learning_rate = learning_rate_of(agent, args, progress)
         optimizer.param_groups[0]["lr"] = learning_rate
-        group = set_curriculum(envs, args, progress)  # ours
+        training = curriculum(args, progress)  # ours
 
         # lines 3-13: fly one episode in every environment
-        batch, episodes = rollout(agent, envs, args.reward_scale, memory_noise)
-        add_rewards(envs, args, progress, batch, episodes)  # ours
+        batch, episodes = rollout(agent, envs, training, args.reward_scale, memory_noise)
 
         # line 14: returns and advantages
+        group = training["flights_per_start"]
         baseline, scale = returns_baseline(batch, args.gamma, group)  # ours; 0 and 1 with group 1
         values = baseline + scale * batch.critic
         advantages, returns = gae(batch.rewards, values, batch.alive, args.gamma, gae_lambda)
@@ -760,7 +763,6 @@ def main(argv):
     envs = runs.make_envs(args, env_options)
     agent = Agent(args, envs).to(device)  # line 1
     runs.load_checkpoint(agent, args, saved)
-    before_training(agent, args, env_options)
     average = AveragedModel(agent, multi_avg_fn=get_ema_multi_avg_fn(args.weight_average))
     optimizer = torch.optim.Adam(agent.parameters(), eps=1e-5, fused=True)  # train sets its learning rate
     run = runs.Run(

@@ -6,9 +6,9 @@
     python ppo_gtrxl_lander.py --eval-only --checkpoint results/mars_landing/agent.safetensors
 
 Reading order: arguments, recipes, problem, Gated Transformer-XL, agent, PPO, what we add to PPO, training, main.
-From the first section "Shared" on, all ppo_gtrxl_*.py are the same to the letter. A section with "ours" in its heading
-contains nothing from the paper. In the other sections a comment marks what is ours. "Line 8" means line 8 of
-Algorithm 1, "Eq. (7)" the seventh numbered equation of the paper.
+From the first section "Shared" on, all ppo_gtrxl_*.py are the same but for lines that end with "# this problem". A
+section with "ours" in its heading contains nothing from the paper. In the other sections a comment marks what is ours.
+"Line 8" means line 8 of Algorithm 1, "Eq. (7)" the seventh numbered equation of the paper.
 
 T is the number of steps, N of environments, H of heads. L is the memory length, d the width, and dk = d / H.
 Algorithm 1 writes E for our N, and N for its iterations.
@@ -34,7 +34,7 @@ from cuda_graphs import speed_up
 from envs import LANDERS
 from landing.environment import PERIOD
 from landing.rewards import POSITION_SCALE, SPEED_SCALE
-from runs import Schedule, all_reduce_sum
+from runs import Schedule
 
 
 @dataclass
@@ -227,44 +227,36 @@ SLOPE_HEIGHT = 10.0  # m; a descent that is steep from there on has time to beco
 SINK_RATE = 0.8  # m/s; a policy that aims at rest on the ground can come to rest just above it and hover
 
 
-def set_curriculum(envs, args, progress):
-    """Set what only training changes. Returns how many flights in a row have the same draw.
+def curriculum(args, progress):
+    """What this update hands over to the environments, by name (`LanderTraining` of landing/environment.py).
 
     The terminal reward tells errors apart only above its scales. Noise scatters flights in proportion to its std. So
     the scales fall with the noise if --log-std is a schedule, as in our recipe. They never fall below those of
     evaluations. With a learned noise, as in the paper's recipe, the reward is that of evaluations.
     """
-    if isinstance(args.log_std, str):
-        std = math.exp(value_at(args.log_std, progress))
-        envs.position_scale = max(30 * std, POSITION_SCALE)
-        envs.speed_scale = max(10 * std, SPEED_SCALE)
-        envs.aloft_price = ALOFT_PRICE
-        envs.slope_height = SLOPE_HEIGHT
-        envs.sink_rate = SINK_RATE
-    envs.fuel_price = value_at(args.fuel_weight, progress)
-    envs.failed_fuel_share = args.failed_fuel_share
-    envs.slope_price = value_at(args.slope_weight, progress)
     of_lander = LANDERS[args.env_id].failure_probability
     probability = of_lander if args.failure_probability is None else args.failure_probability
-    envs.failure_probability = min(args.failure_emphasis * probability, 1.0)
-    if args.training_failure_size is not None:
-        envs.failure_size = args.training_failure_size
-    envs.thrust_share = args.thrust_share
-    envs.start_spread = args.start_spread
-    envs.wind = value_at(args.wind, progress)
     hold = value_at(args.action_hold, progress) * args.decision_s / PERIOD
-    envs.decision_s = max(round(hold), 1) * PERIOD
-    group = round(value_at(args.flights_per_start, progress))
-    envs.flights_per_start = group
-    return group
-
-
-def add_rewards(envs, args, progress, batch, episodes):
-    """Does nothing here. Training is paid what the environment pays; the rocket's script adds to it."""
-
-
-def before_training(agent, args, env_options):
-    """Does nothing here. The rocket's script prepares its agent for vehicles that differ."""
+    training = {
+        "flights_per_start": round(value_at(args.flights_per_start, progress)),
+        "fuel_price": value_at(args.fuel_weight, progress),
+        "failed_fuel_share": args.failed_fuel_share,
+        "slope_price": value_at(args.slope_weight, progress),
+        "failure_probability": min(args.failure_emphasis * probability, 1.0),
+        "failure_size": args.training_failure_size,
+        "thrust_share": args.thrust_share,
+        "start_spread": args.start_spread,
+        "wind": value_at(args.wind, progress),
+        "decision_s": max(round(hold), 1) * PERIOD,
+    }
+    if isinstance(args.log_std, str):
+        std = math.exp(value_at(args.log_std, progress))
+        training["position_scale"] = max(30 * std, POSITION_SCALE)
+        training["speed_scale"] = max(10 * std, SPEED_SCALE)
+        training["aloft_price"] = ALOFT_PRICE
+        training["slope_height"] = SLOPE_HEIGHT
+        training["sink_rate"] = SINK_RATE
+    return training
 
 
 # Shared: Gated Transformer-XL ("Gated Transformer-XL Implementation") -------------------------------------------------
@@ -374,11 +366,20 @@ class RelativeAttention(nn.Module):
         """
         kv, projections, R = cache
         L = self.memory_length
+        q, kv_of_step = self.project(x, projections)
+        kv[:, :, :, t + L : t + L + 1] = kv_of_step
+        return self.attend(q, kv[:, :, :, t : t + L + 1], R)
+
+    def project(self, x, projections):
+        """One step's query (N, H, 1, dk), and its key and value (2, N, H, 1, dk), of x (N, d)."""
         qkv = F.linear(x, projections)  # (N, 3 d)
-        qkv = qkv.view(len(x), 3, self.num_heads, 1, self.dk).transpose(0, 1)  # (3, N, H, 1, dk)
-        kv[:, :, :, t + L : t + L + 1] = qkv[1:]
-        k, v = kv[:, :, :, t : t + L + 1]  # (N, H, L + 1, dk)
-        scores = qkv[0] @ (k + R).transpose(-1, -2)  # (N, H, 1, L + 1)
+        qkv = qkv.view(-1, 3, self.num_heads, 1, self.dk).transpose(0, 1)  # (3, N, H, 1, dk)
+        return qkv[0], qkv[1:]
+
+    def attend(self, q, window, R):
+        """MultiHead(x) (N, d) of one step, from its query and the window's keys and values (2, N, H, L + 1, dk)."""
+        k, v = window  # (N, H, L + 1, dk)
+        scores = q @ (k + R).transpose(-1, -2)  # (N, H, 1, L + 1)
         attended = scores.softmax(dim=-1) @ v  # (N, H, 1, dk)
         return self.out(attended.flatten(1))
 
@@ -524,11 +525,12 @@ class Batch:
 
 
 @torch.no_grad()
-def rollout(agent, envs, reward_scale, memory_noise):
-    """Fly one episode in each environment (lines 3-13).
+def rollout(agent, envs, training, reward_scale, memory_noise):
+    """Fly one episode in each environment (lines 3-13). `training` is what `curriculum` hands over to them.
 
-    Returns this process's Batch, and {key: (episodes, ...)} of `final_info` for the episodes of all processes.
+    Returns the Batch, and {key: (N, ...)}, the `final_info` of its episodes.
     """
+    next_obs, _ = envs.reset(options={"training": training})
     T, N = envs.episode_steps, envs.num_envs
     zeros = agent.actor_logstd.new_zeros  # on the agent's device, in its precision
     batch = Batch(
@@ -546,7 +548,6 @@ def rollout(agent, envs, reward_scale, memory_noise):
     alive_at = np.zeros((T, N))
     alive = np.ones(N, dtype=bool)
     episodes = {}  # `final_info` of each environment's first episode
-    next_obs, _ = envs.reset()
     batch.obs[:] = torch.as_tensor(next_obs)  # no step stays zero: the features of zeros could be NaN
 
     for t in range(T):  # line 6
@@ -568,9 +569,7 @@ def rollout(agent, envs, reward_scale, memory_noise):
     batch.alive[:] = torch.as_tensor(alive_at)
     # v_t of line 8 and log pi(a_t). Sampling needs neither, so one call computes them for all steps.
     batch.logprobs, _, batch.critic = agent.evaluate_actions(hidden, batch.actions)
-    of_each_process = runs.all_gather(episodes)
-    all_episodes = {key: np.concatenate([part[key] for part in of_each_process]) for key in episodes}
-    return batch, all_episodes
+    return batch, episodes
 
 
 def gae(rewards, values, alive, gamma, gae_lambda):
@@ -592,10 +591,10 @@ def gae(rewards, values, alive, gamma, gae_lambda):
 
 
 def moments(x, alive, dim):
-    """Mean and variance of x (T, N, ...) along dim, over the living steps of all processes. dim is kept as 1."""
-    count = all_reduce_sum(alive.sum(dim, keepdim=True)).clamp(min=1)
-    mean = all_reduce_sum((x * alive).sum(dim, keepdim=True)) / count
-    variance = all_reduce_sum(((x - mean) ** 2 * alive).sum(dim, keepdim=True)) / count
+    """Mean and variance of x (T, N, ...) along dim, over the living steps. dim is kept as 1."""
+    count = runs.total(alive.sum(dim, keepdim=True)).clamp(min=1)
+    mean = runs.total((x * alive).sum(dim, keepdim=True)) / count
+    variance = runs.total(((x - mean) ** 2 * alive).sum(dim, keepdim=True)) / count
     return mean, variance
 
 
@@ -610,12 +609,12 @@ def ppo_loss(agent, batch, mb, clip_coef, vf_coef, ent_coef):
     """The loss -L_CLIP + c1 L_VF - c2 H over the living steps of the episodes `mb`, and the means that are logged.
 
     L_CLIP is Eq. (11). Line 18 prints L_CLIP + c1 L_VF - c2 H. Our sign of L_CLIP raises it where the loss is
-    minimised. L_VF is 1/2 (critic - target)^2. Under torchrun the loss is this process's part of the mean, and
-    `ppo_gradient` sums the gradients. What is logged is the mean over all processes.
+    minimised. L_VF is 1/2 (critic - target)^2. With several processes `runs.total` sums over them: the loss is this
+    process's part of the mean, and what is logged is the whole mean.
     """
     alive = batch.alive[:, mb]
     advantages = batch.advantages[:, mb]
-    steps = all_reduce_sum(alive.sum())
+    steps = runs.total(alive.sum())
 
     def mean(x):
         return (x * alive).sum() / steps
@@ -640,8 +639,8 @@ def ppo_loss(agent, batch, mb, clip_coef, vf_coef, ent_coef):
         losses["old_approx_kl"] = mean(-logratio)
         losses["approx_kl"] = mean((ratio - 1) - logratio)
         losses["clipfrac"] = mean(((ratio - 1.0).abs() > clip_coef).to(ratio.dtype))
-    of_all_processes = all_reduce_sum(torch.stack([value.detach() for value in losses.values()]))
-    return loss, dict(zip(losses, of_all_processes))
+    means = runs.total(torch.stack([value.detach() for value in losses.values()]))
+    return loss, dict(zip(losses, means))
 
 
 def ppo_gradient(args, agent, batch, mb, ent_coef):
@@ -652,7 +651,7 @@ def ppo_gradient(args, agent, batch, mb, ent_coef):
     loss, losses = ppo_loss(agent, batch, mb, args.clip_coef, args.vf_coef, ent_coef)
     agent.zero_grad()
     loss.backward()
-    runs.sum_gradients(agent)  # over the processes of torchrun
+    runs.total([weight.grad for weight in agent.parameters() if weight.grad is not None])  # of all processes
     losses["gradient_norm"] = nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
     return losses
 
@@ -724,6 +723,9 @@ def linear_fit(x, y, alive):
     return fitted[..., 0].to(alive.dtype)
 
 
+SMALLEST_SPREAD = 0.3  # of the mean spread; a step of almost no spread would be divided by almost 0
+
+
 def returns_baseline(batch, gamma, group):
     """The baseline (T, N) and the scale (T, 1) of the value V(s_t) = baseline_t + scale_t * critic(s_t).
 
@@ -732,8 +734,7 @@ def returns_baseline(batch, gamma, group):
 
     Each `group` of neighbouring episodes flew the same start. Their returns from step t on are regressed linearly on
     their observations at step t. The fit is the baseline. Its residuals have a spread at each step, over all flights of
-    all groups. scale^2 is the spread^2 of the step plus (0.3 x the mean spread of the steps)^2. Without the second term
-    a step of almost no spread would be divided by almost 0.
+    all groups. scale^2 is the spread^2 of the step plus (SMALLEST_SPREAD x the mean spread of the steps)^2.
 
     RLOO (Kool et al. 2019) takes the mean return of the other samples of a question as the baseline. GRPO (Shao et al.
     2024) takes the mean return of the whole group, and divides by the group's spread. Both have one return for each
@@ -749,7 +750,7 @@ def returns_baseline(batch, gamma, group):
     baseline = linear_fit(obs, grouped_returns, alive).flatten(1)
     _, variance = moments(monte_carlo - baseline, batch.alive, 1)
     mean_spread = variance.sqrt().mean()  # steps that no flight reaches count as zeros
-    scale = (variance + (0.3 * mean_spread) ** 2 + 1e-8).sqrt()
+    scale = (variance + (SMALLEST_SPREAD * mean_spread) ** 2 + 1e-8).sqrt()
     return baseline, scale
 
 
@@ -777,13 +778,13 @@ def train(args, agent, average, optimizer, envs, run, gradient=ppo_gradient):
         set_log_std(agent, args, progress)
         learning_rate = learning_rate_of(agent, args, progress)
         optimizer.param_groups[0]["lr"] = learning_rate
-        group = set_curriculum(envs, args, progress)  # ours
+        training = curriculum(args, progress)  # ours
 
         # lines 3-13: fly one episode in every environment
-        batch, episodes = rollout(agent, envs, args.reward_scale, memory_noise)
-        add_rewards(envs, args, progress, batch, episodes)  # ours
+        batch, episodes = rollout(agent, envs, training, args.reward_scale, memory_noise)
 
         # line 14: returns and advantages
+        group = training["flights_per_start"]
         baseline, scale = returns_baseline(batch, args.gamma, group)  # ours; 0 and 1 with group 1
         values = baseline + scale * batch.critic
         advantages, returns = gae(batch.rewards, values, batch.alive, args.gamma, gae_lambda)
@@ -819,7 +820,6 @@ def main(argv):
     envs = runs.make_envs(args, env_options)
     agent = Agent(args, envs).to(device)  # line 1
     runs.load_checkpoint(agent, args, saved)
-    before_training(agent, args, env_options)
     average = AveragedModel(agent, multi_avg_fn=get_ema_multi_avg_fn(args.weight_average))
     optimizer = torch.optim.Adam(agent.parameters(), eps=1e-5, fused=True)  # train sets its learning rate
     run = runs.Run(

@@ -8,9 +8,9 @@
     python ppo_gtrxl_rocket.py --eval-only --checkpoint results/rocket_fixed/agent.safetensors
 
 Reading order: arguments, recipes, problem, Gated Transformer-XL, agent, PPO, what we add to PPO, training, main.
-From the first section "Shared" on, all ppo_gtrxl_*.py are the same to the letter. A section with "ours" in its heading
-contains nothing from the paper. In the other sections a comment marks what is ours. "Line 8" means line 8 of
-Algorithm 1, "Eq. (7)" the seventh numbered equation of the paper.
+From the first section "Shared" on, all ppo_gtrxl_*.py are the same but for lines that end with "# this problem". A
+section with "ours" in its heading contains nothing from the paper. In the other sections a comment marks what is ours.
+"Line 8" means line 8 of Algorithm 1, "Eq. (7)" the seventh numbered equation of the paper.
 
 T is the number of steps, N of environments, H of heads. L is the memory length, d the width, and dk = d / H.
 Algorithm 1 writes E for our N, and N for its iterations.
@@ -41,7 +41,7 @@ from cuda_graphs import speed_up
 from envs import ROCKETS
 from rocket.policy_constants import DIFFERENCES, WIDE_DIFFERENCES, policy_constants
 from rocket.rewards import TERMINAL_SCALE, mass_rewards
-from runs import Numbers, Schedule, all_reduce_sum
+from runs import Numbers, Schedule
 
 
 @dataclass
@@ -274,11 +274,11 @@ def features(agent, obs):
     one_hot = ((phase - agent.phases).abs() < 1e-3).to(obs.dtype)  # phase: 0 to 1 (the paper's 0 to 3)
 
     differs = (compared(m) - nominal_at(agent, phase, m.energy)) / agent.differences
-    differs = torch.where(agent.nominal_flight.any(), differs.clamp(-10, 10), 0.0)
+    differs = torch.where(has_nominal_flight(agent), differs.clamp(-10, 10), 0.0)
 
     seen = [m.r, m.v, m.altitude, m.climb, m.out_of_plane, m.speed, time_left, m.log_mass, one_hot]
     seen += [m.error, (10 * m.error).tanh()]
-    seen += [draw, differs]  # last: `before_training` clears their weights
+    seen += [draw, differs]  # last: `show_differences` clears their weights
     return torch.cat(seen, dim=-1)
 
 
@@ -301,8 +301,8 @@ def describe(episodes, metrics):
 
 
 # Problem, ours: what only training changes ----------------------------------------------------------------------------
-def set_curriculum(envs, args, progress):
-    """Set what only training changes. Returns how many flights in a row have the same start or draw.
+def curriculum(args, progress):
+    """What this update hands over to the environments, by name (`RocketTraining` of rocket/environment.py).
 
     R_terminal is -2 ln(1 + error / scale). Errors below the scale earn almost the same. Noise scatters the errors of
     the flights by about std / 10. We set the scale a little above that: it falls with the noise, as std / 8, if
@@ -312,29 +312,31 @@ def set_curriculum(envs, args, progress):
     With failures at random moments, every second update flies failures of the last stage at its ignition. They are the
     hardest to save, and rare among random ones.
     """
-    envs.terminal_scale = TERMINAL_SCALE
+    training = {
+        "flights_per_start": round(value_at(args.flights_per_start, progress)),
+        "guidance": args.guidance,
+        "terminal_scale": TERMINAL_SCALE,
+    }
     if isinstance(args.log_std, str):
         std = math.exp(value_at(args.log_std, progress))
         smallest = 0.001 if has_draws(args) else 0.0
-        envs.terminal_scale = min(TERMINAL_SCALE, max(std / 8, smallest))
-    envs.guidance = args.guidance
+        training["terminal_scale"] = min(TERMINAL_SCALE, max(std / 8, smallest))
     if args.failure and args.failure_time == "random":
         updates_before = round(progress * (args.total_updates - 1))
-        envs.failure_time = "ignition" if updates_before % 2 else "random"
-    group = round(value_at(args.flights_per_start, progress))
-    envs.flights_per_start = group
-    return group
+        training["failure_time"] = "ignition" if updates_before % 2 else "random"
+    return training
 
 
-def add_rewards(envs, args, progress, batch, episodes):
+def add_rewards(args, progress, training, envs, batch, episodes):
     """With cut-off, add `mass_rewards` to the flights' last steps."""
     weight = value_at(args.mass_weight, progress)
     if not envs.cutoff or weight == 0:
         return
-    group = len(episodes["error"])  # without draws all flights of all processes have the same start
+    compared_flights = runs.gathered(episodes)  # of all processes
+    group = len(compared_flights["error"])  # without draws all flights have the same start
     if has_draws(args):
-        group = envs.flights_per_start
-    paid = weight * mass_rewards(episodes, envs.rocket, envs.terminal_scale, group)
+        group = training["flights_per_start"]
+    paid = weight * mass_rewards(compared_flights, envs.rocket, training["terminal_scale"], group)
     paid = runs.local_shard(paid, envs.num_envs)  # the part of this process's flights
     last_step = batch.alive.sum(0).long() - 1  # (N,)
     flight = torch.arange(envs.num_envs)
@@ -354,34 +356,38 @@ def nominal_at(agent, phase, energy):
     energy still to gain, and what they will still add to their orbits is nearly the same. So the difference of their
     orbits now is about their difference at the end.
 
-    `nominal_flight` has one row for each step. Between two rows of a burn the values are linear in the energy. Beyond
-    a burn's first or last row the nearest two rows are extrapolated. Energies are between -1 and 0 and rise within a
-    burn. So burn + energy rises over the whole flight, and one sorted key finds the row. In a coast the energy and the
-    orbit stay as they are, so the coast's first row is taken.
+    `nominal_flight` has a row for each step: burn, energy and `compared`. Between two rows of a burn the values are
+    linear in the energy. Beyond a burn's first or last row the nearest two rows are extrapolated. In a coast the energy
+    and the orbit stay as they are, so the coast's first row is taken.
     """
     rows = agent.nominal_flight
-    burn = (phase * (len(agent.phases) - 1)).round().contiguous()
-    key = (burn + energy).contiguous()
     burns = rows[:, 0].contiguous()  # searchsorted warns of any other layout
     energies = rows[:, 1].contiguous()
-    first_of_burn = torch.searchsorted(burns, burn)
-    last_of_burn = torch.searchsorted(burns, burn, right=True) - 1
+    burn = (phase * (len(agent.phases) - 1)).round().contiguous()
+    first = torch.searchsorted(burns, burn)  # the rows of this burn, from `first` to `last`
+    last = torch.searchsorted(burns, burn, right=True) - 1
 
-    after = torch.searchsorted(burns + energies, key)  # the first row whose key is not smaller
-    after = torch.maximum(after, first_of_burn + 1)
-    after = torch.minimum(after, last_of_burn).clamp(min=1)[..., 0]
-    row_before, row_after = rows[after - 1], rows[after]
-    share = (energy - row_before[..., 1:2]) / (row_after[..., 1:2] - row_before[..., 1:2]).clamp(min=1e-7)
-    in_burn = torch.lerp(row_before[..., 2:], row_after[..., 2:], share)
+    # rows are sorted by burn and, within a burn, by energy, which is between -1 and 0: so also by burn + energy
+    above = torch.searchsorted(burns + energies, (burn + energy).contiguous())  # the first row that is not below
+    above = above.maximum(first + 1).minimum(last)  # it and the row below it are of this burn
+    above = above.clamp(min=1)[..., 0]  # also where the table is still empty
+    row_below, row_above = rows[above - 1], rows[above]
+    share = (energy - row_below[..., 1:2]) / (row_above[..., 1:2] - row_below[..., 1:2]).clamp(min=1e-7)
+    in_burn = torch.lerp(row_below[..., 2:], row_above[..., 2:], share)
 
-    begins = first_of_burn.clamp(max=len(rows) - 1)
-    coasts = energies[last_of_burn] - energies[begins] < 1e-6
+    begins = first.clamp(max=len(rows) - 1)
+    coasts = energies[last] - energies[begins] < 1e-6
     in_coast = rows[begins[..., 0], 2:]
     return torch.where(coasts, in_coast, in_burn)
 
 
+def has_nominal_flight(agent):
+    """Whether the agent has a nominal flight, a tensor (). Its first energy is below 0; without a flight it is 0."""
+    return agent.nominal_flight[0, 1] < 0
+
+
 @torch.no_grad()
-def before_training(agent, args, env_options):
+def show_differences(agent, args, env_options):
     """Before a dispersed training, let its first policy fly the nominal flight, and store this flight in the agent.
 
     The draw and the differences are new inputs to that policy. Their weights are set to 0, so the policy flies as
@@ -392,7 +398,7 @@ def before_training(agent, args, env_options):
         return
     if args.failure:
         widen_differences(agent)
-    if agent.nominal_flight.any():  # a policy of a dispersed training has its nominal flight already
+    if has_nominal_flight(agent):  # a policy of a dispersed training has its nominal flight already
         return
     exact = {**env_options, "dispersion": 0.0, "failure": 0.0, "navigation_noise": None}
     envs = gym.make_vec(args.env_id, num_envs=1, **exact)
@@ -534,11 +540,20 @@ class RelativeAttention(nn.Module):
         """
         kv, projections, R = cache
         L = self.memory_length
+        q, kv_of_step = self.project(x, projections)
+        kv[:, :, :, t + L : t + L + 1] = kv_of_step
+        return self.attend(q, kv[:, :, :, t : t + L + 1], R)
+
+    def project(self, x, projections):
+        """One step's query (N, H, 1, dk), and its key and value (2, N, H, 1, dk), of x (N, d)."""
         qkv = F.linear(x, projections)  # (N, 3 d)
-        qkv = qkv.view(len(x), 3, self.num_heads, 1, self.dk).transpose(0, 1)  # (3, N, H, 1, dk)
-        kv[:, :, :, t + L : t + L + 1] = qkv[1:]
-        k, v = kv[:, :, :, t : t + L + 1]  # (N, H, L + 1, dk)
-        scores = qkv[0] @ (k + R).transpose(-1, -2)  # (N, H, 1, L + 1)
+        qkv = qkv.view(-1, 3, self.num_heads, 1, self.dk).transpose(0, 1)  # (3, N, H, 1, dk)
+        return qkv[0], qkv[1:]
+
+    def attend(self, q, window, R):
+        """MultiHead(x) (N, d) of one step, from its query and the window's keys and values (2, N, H, L + 1, dk)."""
+        k, v = window  # (N, H, L + 1, dk)
+        scores = q @ (k + R).transpose(-1, -2)  # (N, H, 1, L + 1)
         attended = scores.softmax(dim=-1) @ v  # (N, H, 1, dk)
         return self.out(attended.flatten(1))
 
@@ -684,11 +699,12 @@ class Batch:
 
 
 @torch.no_grad()
-def rollout(agent, envs, reward_scale, memory_noise):
-    """Fly one episode in each environment (lines 3-13).
+def rollout(agent, envs, training, reward_scale, memory_noise):
+    """Fly one episode in each environment (lines 3-13). `training` is what `curriculum` hands over to them.
 
-    Returns this process's Batch, and {key: (episodes, ...)} of `final_info` for the episodes of all processes.
+    Returns the Batch, and {key: (N, ...)}, the `final_info` of its episodes.
     """
+    next_obs, _ = envs.reset(options={"training": training})
     T, N = envs.episode_steps, envs.num_envs
     zeros = agent.actor_logstd.new_zeros  # on the agent's device, in its precision
     batch = Batch(
@@ -706,7 +722,6 @@ def rollout(agent, envs, reward_scale, memory_noise):
     alive_at = np.zeros((T, N))
     alive = np.ones(N, dtype=bool)
     episodes = {}  # `final_info` of each environment's first episode
-    next_obs, _ = envs.reset()
     batch.obs[:] = torch.as_tensor(next_obs)  # no step stays zero: the features of zeros could be NaN
 
     for t in range(T):  # line 6
@@ -728,9 +743,7 @@ def rollout(agent, envs, reward_scale, memory_noise):
     batch.alive[:] = torch.as_tensor(alive_at)
     # v_t of line 8 and log pi(a_t). Sampling needs neither, so one call computes them for all steps.
     batch.logprobs, _, batch.critic = agent.evaluate_actions(hidden, batch.actions)
-    of_each_process = runs.all_gather(episodes)
-    all_episodes = {key: np.concatenate([part[key] for part in of_each_process]) for key in episodes}
-    return batch, all_episodes
+    return batch, episodes
 
 
 def gae(rewards, values, alive, gamma, gae_lambda):
@@ -752,10 +765,10 @@ def gae(rewards, values, alive, gamma, gae_lambda):
 
 
 def moments(x, alive, dim):
-    """Mean and variance of x (T, N, ...) along dim, over the living steps of all processes. dim is kept as 1."""
-    count = all_reduce_sum(alive.sum(dim, keepdim=True)).clamp(min=1)
-    mean = all_reduce_sum((x * alive).sum(dim, keepdim=True)) / count
-    variance = all_reduce_sum(((x - mean) ** 2 * alive).sum(dim, keepdim=True)) / count
+    """Mean and variance of x (T, N, ...) along dim, over the living steps. dim is kept as 1."""
+    count = runs.total(alive.sum(dim, keepdim=True)).clamp(min=1)
+    mean = runs.total((x * alive).sum(dim, keepdim=True)) / count
+    variance = runs.total(((x - mean) ** 2 * alive).sum(dim, keepdim=True)) / count
     return mean, variance
 
 
@@ -770,12 +783,12 @@ def ppo_loss(agent, batch, mb, clip_coef, vf_coef, ent_coef):
     """The loss -L_CLIP + c1 L_VF - c2 H over the living steps of the episodes `mb`, and the means that are logged.
 
     L_CLIP is Eq. (11). Line 18 prints L_CLIP + c1 L_VF - c2 H. Our sign of L_CLIP raises it where the loss is
-    minimised. L_VF is 1/2 (critic - target)^2. Under torchrun the loss is this process's part of the mean, and
-    `ppo_gradient` sums the gradients. What is logged is the mean over all processes.
+    minimised. L_VF is 1/2 (critic - target)^2. With several processes `runs.total` sums over them: the loss is this
+    process's part of the mean, and what is logged is the whole mean.
     """
     alive = batch.alive[:, mb]
     advantages = batch.advantages[:, mb]
-    steps = all_reduce_sum(alive.sum())
+    steps = runs.total(alive.sum())
 
     def mean(x):
         return (x * alive).sum() / steps
@@ -800,8 +813,8 @@ def ppo_loss(agent, batch, mb, clip_coef, vf_coef, ent_coef):
         losses["old_approx_kl"] = mean(-logratio)
         losses["approx_kl"] = mean((ratio - 1) - logratio)
         losses["clipfrac"] = mean(((ratio - 1.0).abs() > clip_coef).to(ratio.dtype))
-    of_all_processes = all_reduce_sum(torch.stack([value.detach() for value in losses.values()]))
-    return loss, dict(zip(losses, of_all_processes))
+    means = runs.total(torch.stack([value.detach() for value in losses.values()]))
+    return loss, dict(zip(losses, means))
 
 
 def ppo_gradient(args, agent, batch, mb, ent_coef):
@@ -812,7 +825,7 @@ def ppo_gradient(args, agent, batch, mb, ent_coef):
     loss, losses = ppo_loss(agent, batch, mb, args.clip_coef, args.vf_coef, ent_coef)
     agent.zero_grad()
     loss.backward()
-    runs.sum_gradients(agent)  # over the processes of torchrun
+    runs.total([weight.grad for weight in agent.parameters() if weight.grad is not None])  # of all processes
     losses["gradient_norm"] = nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
     return losses
 
@@ -884,6 +897,9 @@ def linear_fit(x, y, alive):
     return fitted[..., 0].to(alive.dtype)
 
 
+SMALLEST_SPREAD = 0.3  # of the mean spread; a step of almost no spread would be divided by almost 0
+
+
 def returns_baseline(batch, gamma, group):
     """The baseline (T, N) and the scale (T, 1) of the value V(s_t) = baseline_t + scale_t * critic(s_t).
 
@@ -892,8 +908,7 @@ def returns_baseline(batch, gamma, group):
 
     Each `group` of neighbouring episodes flew the same start. Their returns from step t on are regressed linearly on
     their observations at step t. The fit is the baseline. Its residuals have a spread at each step, over all flights of
-    all groups. scale^2 is the spread^2 of the step plus (0.3 x the mean spread of the steps)^2. Without the second term
-    a step of almost no spread would be divided by almost 0.
+    all groups. scale^2 is the spread^2 of the step plus (SMALLEST_SPREAD x the mean spread of the steps)^2.
 
     RLOO (Kool et al. 2019) takes the mean return of the other samples of a question as the baseline. GRPO (Shao et al.
     2024) takes the mean return of the whole group, and divides by the group's spread. Both have one return for each
@@ -909,7 +924,7 @@ def returns_baseline(batch, gamma, group):
     baseline = linear_fit(obs, grouped_returns, alive).flatten(1)
     _, variance = moments(monte_carlo - baseline, batch.alive, 1)
     mean_spread = variance.sqrt().mean()  # steps that no flight reaches count as zeros
-    scale = (variance + (0.3 * mean_spread) ** 2 + 1e-8).sqrt()
+    scale = (variance + (SMALLEST_SPREAD * mean_spread) ** 2 + 1e-8).sqrt()
     return baseline, scale
 
 
@@ -937,13 +952,14 @@ def train(args, agent, average, optimizer, envs, run, gradient=ppo_gradient):
         set_log_std(agent, args, progress)
         learning_rate = learning_rate_of(agent, args, progress)
         optimizer.param_groups[0]["lr"] = learning_rate
-        group = set_curriculum(envs, args, progress)  # ours
+        training = curriculum(args, progress)  # ours
 
         # lines 3-13: fly one episode in every environment
-        batch, episodes = rollout(agent, envs, args.reward_scale, memory_noise)
-        add_rewards(envs, args, progress, batch, episodes)  # ours
+        batch, episodes = rollout(agent, envs, training, args.reward_scale, memory_noise)
+        add_rewards(args, progress, training, envs, batch, episodes)  # this problem
 
         # line 14: returns and advantages
+        group = training["flights_per_start"]
         baseline, scale = returns_baseline(batch, args.gamma, group)  # ours; 0 and 1 with group 1
         values = baseline + scale * batch.critic
         advantages, returns = gae(batch.rewards, values, batch.alive, args.gamma, gae_lambda)
@@ -979,7 +995,7 @@ def main(argv):
     envs = runs.make_envs(args, env_options)
     agent = Agent(args, envs).to(device)  # line 1
     runs.load_checkpoint(agent, args, saved)
-    before_training(agent, args, env_options)
+    show_differences(agent, args, env_options)  # this problem
     average = AveragedModel(agent, multi_avg_fn=get_ema_multi_avg_fn(args.weight_average))
     optimizer = torch.optim.Adam(agent.parameters(), eps=1e-5, fused=True)  # train sets its learning rate
     run = runs.Run(

@@ -109,7 +109,7 @@ NETWORK = ("num_blocks", "embed_dim", "num_heads", "memory_length", "mlp_dim", "
 NOT_OF_A_CHECKPOINT = {"dispersion", "failure", "navigation_noise"}
 # environment options that a checkpoint decides unless they are typed
 MAY_DIFFER_FROM_A_CHECKPOINT = {"failure_probability", "failure_size", "failure_time"}
-CHANGED_BY_TRAINING = {"differences"}  # constants of an agent that a training may set anew
+CHANGED_BY_TRAINING = {"differences", "nominal_flight"}  # buffers of an agent that a training may set anew
 MAY_CHANGE_ON_RESUME = {"resume", "cuda", "num_threads"}
 
 
@@ -526,11 +526,8 @@ def load_checkpoint(agent, args, saved):
 
 
 def constants_of(agent):
-    """{name: buffer} of a new agent, without the buffers that a training changes or fills.
-
-    A buffer that a training fills is zero in a new agent.
-    """
-    return {name: x for name, x in agent.named_buffers() if x.any() and name not in CHANGED_BY_TRAINING}
+    """{name: buffer} of an agent, without the buffers that a training changes."""
+    return {name: x for name, x in agent.named_buffers() if name not in CHANGED_BY_TRAINING}
 
 
 def finite(values, epoch, minibatch):
@@ -655,11 +652,12 @@ class Run:
     def end_update(self, iteration, alive, episodes, losses, learning_rate):
         """Count and log an update. Save every ten updates, evaluate every --eval-every, and print a line now and then.
 
-        alive (T, N) is the batch's. episodes is the `final_info` of all processes. losses are means over the update.
+        alive (T, N) is the batch's, episodes the `final_info` of its flights. losses are means over the update.
         """
         args = self.args
         now = time.time()
-        steps = int(all_reduce_sum(alive.sum()))
+        steps = int(total(alive.sum()))
+        episodes = gathered(episodes)
         self.progress = {**self.progress, "total_updates": iteration, "wall_seconds": now - self.began}
         self.progress["global_step"] += steps
         self.progress["training_seconds"] += now - self.update_began
@@ -905,6 +903,12 @@ def all_gather(value):
     return values
 
 
+def gathered(episodes):
+    """The `final_info` {key: (N, ...)} of the flights of all processes, in the order of their ranks."""
+    of_each_process = all_gather(episodes)
+    return {key: np.concatenate([part[key] for part in of_each_process]) for key in episodes}
+
+
 def local_shard(values, count):
     """This process's part of `values`, which hold `count` values for each process in the order of their ranks."""
     rank, _ = rank_and_world_size()
@@ -912,19 +916,17 @@ def local_shard(values, count):
     return values[begin : begin + count]
 
 
-def sum_gradients(agent):
-    """Sum the gradients over all processes, in place. One buffer holds them all, because each exchange takes time."""
+def total(x):
+    """The sum over all processes of a tensor, or of each tensor of a list, in place. In one process it is x itself.
+
+    One buffer holds all tensors of a list, because each exchange takes time.
+    """
     if not dist.is_initialized():
-        return
-    gradients = [parameter.grad for parameter in agent.parameters() if parameter.grad is not None]
-    flat = all_reduce_sum(torch.cat([gradient.flatten() for gradient in gradients]))
-    parts = flat.split([gradient.numel() for gradient in gradients])
-    for gradient, part in zip(gradients, parts):
-        gradient.copy_(part.view_as(gradient))
-
-
-def all_reduce_sum(x):
-    """The sum of a tensor over all processes, in place."""
-    if dist.is_initialized():
+        return x
+    if isinstance(x, torch.Tensor):
         dist.all_reduce(x)
+        return x
+    flat = total(torch.cat([tensor.flatten() for tensor in x]))
+    for tensor, part in zip(x, flat.split([tensor.numel() for tensor in x])):
+        tensor.copy_(part.view_as(tensor))
     return x

@@ -210,10 +210,20 @@ def fly(agent, env) -> Flown:
     return Flown(*columns, torch.tensor(last), bool(final["crashed"].any()))
 
 
-def directions(agent, physics: Physics, y, shown, cache, t):
-    """The policy's directions (..., 3) in ECI, in states y (..., 7) with the other observations `shown` (..., 3)."""
-    obs = torch.cat([y[..., :6], shown], dim=-1)
-    return physics.to_eci(agent.get_mean_action(agent.encode_step(obs, cache, t)), y)
+def directions(agent, physics: Physics, y, shown, memories: list):
+    """The policy's directions (..., 3) in ECI, in states y (..., 7) with the other observations `shown` (..., 3).
+
+    As `Agent.encode_step`, but nothing is written into a cache, which autograd could not follow. Each block's entry of
+    `memories` is replaced: the keys and values of the last L steps, and two constants (`start_memories`).
+    """
+    x = agent.encoder(ppo_gtrxl_rocket.features(agent, torch.cat([y[..., :6], shown], dim=-1)))
+    for k, block in enumerate(agent.blocks):
+        past, projections, R = memories[k]
+        q, kv = block.attention.project(x, projections)
+        window = torch.cat([past, kv], dim=3)
+        x = block(x, block.attention.attend(q, window, R))
+        memories[k] = window[:, :, :, 1:], projections, R
+    return physics.to_eci(agent.get_mean_action(x), y)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -237,9 +247,9 @@ def unrolled(agent, physics: Physics, flights: Flown):
     T, n = flights.y.shape[:2]
     states = [flights.y[0]]
     flown = []
-    cache = empty_cache(agent, n)
+    memories = start_memories(agent, n)
     for t in range(T):
-        flown.append(directions(agent, physics, states[t], flights.shown[t], cache, t))
+        flown.append(directions(agent, physics, states[t], flights.shown[t], memories))
         states.append(physics.advance(np.array([t]), states[t][None], flown[t][None])[0])
     ends = flights.last, torch.arange(n)
     outcome = physics.outcome(flights.last, torch.stack(states)[ends], torch.stack(flown)[ends])
@@ -252,29 +262,10 @@ def all_rows(outputs, weights: list, rows):
     return torch.cat([part.flatten(start_dim=1) for part in parts], dim=1)
 
 
-class Window:
-    """Keys and values of the last L + 1 steps, for `RelativeAttention.step`, which writes into its cache.
-
-    Autograd cannot follow writes into one cache. It can follow a new tensor for every step.
-    """
-
-    def __init__(self, kv):
-        self.kv, self.length = kv, kv.shape[3]
-
-    def __setitem__(self, place, value):
-        self.kv = torch.cat([self.kv[:, :, :, -self.length :], value], dim=3)
-
-    def __getitem__(self, place):
-        return self.kv
-
-
-def empty_cache(agent, n: int) -> list:
-    """The caches of `Agent.encode_step` at the begin of a flight."""
-    cache = []
-    for block, memory in zip(agent.blocks, agent.new_memory(n, noise=0.0)):
-        kv, projections, R = block.attention.start_cache(memory, 0)
-        cache.append((Window(kv), projections, R))
-    return cache
+def start_memories(agent, n: int) -> list:
+    """What `directions` remembers at the begin of a flight: a memory of zeros in each block."""
+    zeros = agent.new_memory(n, noise=0.0)
+    return [block.attention.start_cache(memory, 0) for block, memory in zip(agent.blocks, zeros)]
 
 
 def adjoint(agent, physics: Physics, flights: Flown):
@@ -290,7 +281,7 @@ def adjoint(agent, physics: Physics, flights: Flown):
     T, n = flights.y.shape[:2]
     y, u = flights.y.requires_grad_(), flights.u.requires_grad_()
     A, B = by_rows(physics.advance(np.arange(T), y, u), [y, u])
-    (K,) = by_rows(directions(agent, physics, y, flights.shown, [], 0), [y])
+    (K,) = by_rows(directions(agent, physics, y, flights.shown, []), [y])
     ends = flights.last, torch.arange(n)
     y_last = y.detach()[ends].requires_grad_()
     u_last = u.detach()[ends].requires_grad_()
@@ -305,7 +296,7 @@ def adjoint(agent, physics: Physics, flights: Flown):
 
     J, g = [], torch.stack(g)  # (T, n, 7, 3)
     for k in range(n):
-        of_flight = directions(agent, physics, y[:, k].detach(), flights.shown[:, k], [], 0)  # (T, 3)
+        of_flight = directions(agent, physics, y[:, k].detach(), flights.shown[:, k], [])  # (T, 3)
         J.append(all_rows(of_flight, weights_of(agent), g[:, k].transpose(0, 1)))
     return outcome.detach(), torch.stack(J)
 

@@ -68,7 +68,7 @@ class OurFeatures(VecEnvWrapper):
 
 
 class OurCurriculum(BaseCallback):
-    """Before each rollout, set what our script changes by the share of training done, and the price of propellant.
+    """Before each rollout, hand over what our script does by the share of training done, and a price of propellant.
 
     Our script compares the masses of flights that have all ended (`add_rewards`). This library's rollouts end in the
     middle of flights, so here propellant has a price by the kilogram. It is zero in the first quarter, highest at 60 %,
@@ -85,11 +85,12 @@ class OurCurriculum(BaseCallback):
     def _on_rollout_start(self):
         progress = self.num_timesteps / self.samples
         self.args.log_std = self.model.policy.log_std.mean().item()  # as it was learned
-        self.script.set_curriculum(self.batch, self.args, progress)
+        training = self.script.curriculum(self.args, progress)
         if hasattr(type(self.args), "mass_weight"):  # the rocket's script
             price = np.interp(progress, [0.25, 0.6, 1.0], [0.0, 1.0, 0.1])
-            self.batch.mass_weight = float(self.batch.cutoff * self.args.mass_weight * price)
-        self.batch.flights_per_start = 1  # the library compares no flights of one start
+            training["mass_weight"] = float(self.batch.cutoff * self.args.mass_weight * price)
+        training["flights_per_start"] = 1  # the library compares no flights of one start
+        self.batch.hand_over(training)  # not at a reset, because its rollouts end in the middle of flights
 
     def _on_step(self):
         return True

@@ -133,7 +133,7 @@ def test_table_1_is_plain_ppo(name):
 
 def test_episodes_of_different_lengths(uneven_envs, monkeypatch):
     """An episode that has ended weighs nothing more, in the advantages, their normalisation and the loss."""
-    monkeypatch.setattr(ppo_gtrxl_di, "set_curriculum", lambda *inputs: 1)  # these environments have none
+    monkeypatch.setattr(ppo_gtrxl_di, "curriculum", lambda *inputs: {"flights_per_start": 1})
     args = ppo_gtrxl_di.Args(total_updates=UPDATES, **TINY)
     check(ppo_gtrxl_di, args, lambda: uneven_envs((6, 2, 5, 1, 6, 3, 4)))
 

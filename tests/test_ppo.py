@@ -1,6 +1,6 @@
 """PPO of the scripts: GAE, groups, loss, update, schedules against sums, cases and averages written out by hand.
 
-The scripts' shared sections are the same to the letter (test_scripts.py), so one script stands for all.
+The scripts' shared sections are the same (test_scripts.py), so one script stands for all.
 """
 
 import copy
@@ -57,7 +57,7 @@ class Learner:
         self.collect()
 
     def collect(self):
-        self.batch, _ = script.rollout(self.agent, self.envs, 1.0, 0.1)
+        self.batch, _ = script.rollout(self.agent, self.envs, {}, 1.0, 0.1)
 
     def update(self, iteration=1):
         modules = self.agent, self.average, self.optimizer
@@ -127,8 +127,8 @@ def test_schedule_is_linear_between_its_points():
 ])  # fmt: skip
 def test_radius_curriculum(name, env_id, first):
     """From about K times the radius, geometrically, to the true one; from there on a tenth less, flown in groups."""
-    script, envs = importlib.import_module(name), gym.make_vec(env_id, num_envs=1)
-    args = script.Args(**script.RECIPES[env_id])
+    script = importlib.import_module(name)
+    args = script.Args(env_id=env_id, **script.RECIPES[env_id])
     refined = float(args.log_radius.split()[-2].split(":")[0])
     for progress, scale in (
         (0.0, first),
@@ -137,12 +137,13 @@ def test_radius_curriculum(name, env_id, first):
         (refined, 0.9),
         (1.0, 0.9),
     ):
-        group = script.set_curriculum(envs, args, progress)
-        assert envs.radius_scale == pytest.approx(scale, rel=0.02)
-        assert envs.bonus_width == (0.4 if progress >= refined else 0.0)
-        assert group == envs.flights_per_start == (8 if progress >= refined else 1)
-    assert script.set_curriculum(envs, script.Args(), 0.7) == 1  # the paper
-    assert envs.radius_scale == 1 and envs.bonus_width == 0
+        training = script.curriculum(args, progress)
+        assert training["radius_scale"] == pytest.approx(scale, rel=0.02)
+        assert training["bonus_width"] == (0.4 if progress >= refined else 0.0)
+        assert training["flights_per_start"] == (8 if progress >= refined else 1)
+    paper = script.curriculum(script.Args(env_id=env_id), 0.7)
+    assert paper == {"flights_per_start": 1, "radius_scale": 1, "bonus_width": 0}
+    assert script.curriculum(script.Args(), 0.7) == {"flights_per_start": 1}  # no circles
 
 
 @pytest.mark.parametrize("std, dispersion, scale", [
@@ -150,13 +151,13 @@ def test_radius_curriculum(name, env_id, first):
 ])  # fmt: skip
 def test_the_rockets_curriculum(std, dispersion, scale):
     """R_terminal's scale is an eighth of the noise, within its bounds; guidance and groups are those of the flags."""
-    rocket, envs = importlib.import_module("ppo_gtrxl_rocket"), gym.make_vec("RocketAscentCutoff-v0", num_envs=1)
+    rocket = importlib.import_module("ppo_gtrxl_rocket")
     log_std = f"0:0.2 0.5:{math.log(std)} 1:-7"
     args = rocket.Args(guidance=True, flights_per_start=16, dispersion=dispersion, log_std=log_std)
-    assert rocket.set_curriculum(envs, args, 0.5) == envs.flights_per_start == 16
-    assert envs.guidance and envs.terminal_scale == pytest.approx(scale)
-    rocket.set_curriculum(envs, rocket.Args(), 0.5)  # the paper
-    assert envs.flights_per_start == 1 and envs.terminal_scale == 0.005 and not envs.guidance
+    training = rocket.curriculum(args, 0.5)
+    assert training == {"flights_per_start": 16, "guidance": True, "terminal_scale": pytest.approx(scale)}
+    paper = rocket.curriculum(rocket.Args(), 0.5)
+    assert paper == {"flights_per_start": 1, "guidance": False, "terminal_scale": 0.005}
 
 
 @pytest.mark.parametrize("asked", ["random", "ignition"])
@@ -167,8 +168,7 @@ def test_every_second_update_of_random_failures_flies_those_at_the_last_ignition
     envs = gym.make_vec("RocketAscentCutoff-v0", num_envs=40, **options)
     args = rocket.Args(**options, total_updates=300)
     for before in (*range(6), 298, 299):
-        rocket.set_curriculum(envs, args, before / 299)
-        envs.reset(seed=before)
+        envs.reset(seed=before, options={"training": rocket.curriculum(args, before / 299)})
         groups, moments, _ = envs.unwrapped.vehicles.failure[:, envs.unwrapped.vehicles.failure[0] >= 0]
         at_ignition = set(groups) == {3} and np.ptp(moments) == 0
         assert at_ignition == (asked == "ignition" or before % 2 == 1)
@@ -209,13 +209,12 @@ def test_memory_noise_half_way(learner, monkeypatch):
     class Asked(Exception):
         pass
 
-    def rollout(agent, envs, reward_scale, memory_noise):
+    def rollout(agent, envs, training, reward_scale, memory_noise):
         raise Asked(memory_noise)
 
     def of_update(iteration, **changes):
         run, start = learner(total_updates=11, **changes), SimpleNamespace(updates_done=iteration - 1)
         with monkeypatch.context() as patch, pytest.raises(Asked) as asked:
-            patch.setattr(script, "set_curriculum", lambda *inputs: 1)
             patch.setattr(script, "rollout", rollout)
             script.train(run.args, run.agent, run.average, run.optimizer, run.envs, start)
         return asked.value.args[0]
@@ -349,8 +348,7 @@ def test_flights_of_a_group_share_their_start_and_nothing_else(env_id):
     args = make_args(env_id=env_id, flights_per_start=3)
     envs = gym.make_vec(env_id, num_envs=6)
     envs.reset(seed=1)
-    script.set_curriculum(envs, args, 0.0)
-    batch, _ = script.rollout(make_agent(args, envs), envs, 1.0, 0.1)
+    batch, _ = script.rollout(make_agent(args, envs), envs, script.curriculum(args, 0.0), 1.0, 0.1)
     first, second = batch.obs[0, :3], batch.obs[0, 3:]
     assert (first == first[0]).all() and (second == second[0]).all() and (first[0, :2] != second[0, :2]).all()
     for own in (batch.actions[0, :, 0], batch.logprobs[0], batch.obs[1, :, 1], batch.rewards[1]):
@@ -517,7 +515,7 @@ def test_rewards_are_scaled_in_training_and_logged_unscaled():
     args = make_args()
     envs = gym.make_vec(args.env_id, num_envs=3)
     envs.reset(seed=1)
-    batch, episodes = script.rollout(make_agent(args, envs), envs, 0.1, 0.1)
+    batch, episodes = script.rollout(make_agent(args, envs), envs, {}, 0.1, 0.1)
     assert batch.rewards.shape == (50, 3) and batch.alive.all()
     np.testing.assert_allclose(batch.rewards.sum(0) / 0.1, episodes["episodic_return"], rtol=1e-9)
     x, v, u = batch.obs[..., 0], batch.obs[..., 1], batch.actions[..., 0].clip(-4, 4)

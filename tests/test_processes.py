@@ -31,7 +31,7 @@ NETWORK = [f"--{name.replace('_', '-')}={value}" for name, value in SIZES.items(
 
 def batch_of(envs, agent):
     torch.manual_seed(1)
-    return script.rollout(agent, envs, 1.0, 0.1)
+    return script.rollout(agent, envs, {}, 1.0, 0.1)
 
 
 def share(batch, episodes):

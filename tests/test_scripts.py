@@ -83,12 +83,23 @@ def shared(text):
     return "".join(lines[next(k for k, line in enumerate(lines) if line.startswith("# Shared")) :])
 
 
-def test_shared_sections_are_the_same_to_the_letter():
-    texts = [path.read_text() for path in SCRIPTS]
-    assert len(texts) >= 2
-    assert len({shared(text) for text in texts}) == 1
-    changed = texts[0].replace("lastgaelam = (delta + ", "lastgaelam = (delta - ")
-    assert changed != texts[0] and shared(changed) != shared(texts[1])  # one character is seen
+# by script, the lines of the shared sections that only it has; they end with "# this problem"
+ITS_OWN = {
+    "ppo_gtrxl_rocket": [
+        "add_rewards(args, progress, training, envs, batch, episodes)",
+        "show_differences(agent, args, env_options)",
+    ]
+}
+
+
+def test_shared_sections_are_the_same_but_for_the_lines_of_a_problem():
+    common = set()
+    for path in SCRIPTS:
+        lines = shared(path.read_text()).splitlines()
+        own = [line for line in lines if line.endswith("  # this problem")]
+        assert [line.removesuffix("  # this problem").strip() for line in own] == ITS_OWN.get(path.stem, [])
+        common.add("\n".join(line for line in lines if line not in own))
+    assert len(SCRIPTS) >= 2 and len(common) == 1
 
 
 # Table 1 of the paper: (double integrator, Van der Pol, rocket)
