@@ -38,6 +38,7 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 import runs
 from common import flags
+from common.flying import fly_until_ended
 from common.schedule import Schedule
 from cuda_graphs import speed_up
 from envs import ROCKETS
@@ -439,11 +440,7 @@ def fly_nominal(agent, policy, envs):
     """Fly `policy(obs, t)` in one environment and write the flight into the agent's `nominal_flight`."""
     obs, _ = envs.reset()
     flight = [obs]
-    while True:
-        obs, _, ended, _ = envs.advance(policy(obs, len(flight) - 1))
-        flight.append(obs)
-        if ended[0]:
-            break
+    fly_until_ended(envs, policy, obs, lambda step: flight.append(step.next_obs))
 
     obs = torch.as_tensor(np.concatenate(flight)).to(agent.nominal_flight)
     m = motion(agent, obs)

@@ -33,7 +33,7 @@ import torch
 import torch.distributed as dist
 import tyro
 
-import evaluate
+import envs as _envs  # noqa: F401 - makes every id known to `task_of`
 from common import files
 from common.batch import make_batch
 from common.checkpoints import COUNTERS, read_checkpoint
@@ -43,6 +43,7 @@ from common.evaluations import write_evaluation
 from common.flags import Policy, Range, Words, facts, plain_args
 from common.schedule import Schedule
 from common.tasks import Task, task_of
+from drawing.evaluation import draw_animation, draw_figures
 
 gc.freeze()  # imported modules are never garbage, and looking through them takes a fifth of the time of --help
 
@@ -146,7 +147,7 @@ def read_flags(defaults, argv):
             fail(f"{' '.join(first_paragraph).removeprefix('Error parsing ')} (--help lists what is allowed)")
     flags = [word.split("=")[0] for word in argv if word.startswith("--")]
     names = {flag.removeprefix("--").replace("-", "_").removeprefix("no_") for flag in flags}
-    return {name: getattr(args, name) for name in names}
+    return {name: getattr(args, name) for name in names & vars(args).keys()}  # "--" alone names none
 
 
 def allowed(kind):
@@ -659,8 +660,8 @@ class Run:
             paths = (self.folder / name for name in ("agent.safetensors", "eval.json", "eval.npz"))
             write_evaluation(metrics, arrays, *paths)
         if args.capture_video:
-            evaluate.draw_figures(self.folder, arrays, metrics, [read_curve(self.folder)])
-            evaluate.draw_animation(self.folder, arrays, metrics)
+            draw_figures(self.folder, arrays, metrics, [read_curve(self.folder)])
+            draw_animation(self.folder, arrays, metrics)
         print(self.task.table(metrics))
         print(f"run folder: {self.folder}")
 
