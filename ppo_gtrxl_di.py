@@ -20,8 +20,10 @@ Eq. (19). The problems' tables are in envs.py, cost, reward and observation in p
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -31,10 +33,10 @@ from torch.distributions import Normal
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 import runs
-from common.tasks import ForEachId
+from common import flags
+from common.schedule import Schedule
 from cuda_graphs import speed_up
 from envs import PROBLEMS
-from runs import Schedule
 
 
 @dataclass
@@ -43,16 +45,16 @@ class Args:
 
     --recipe paper uses these values. --recipe ours, the default, first replaces those that RECIPES names. A flag that
     is typed wins over both. A Schedule is one number, or points "place:value place:value ...". Place 0 is the first
-    update, place 1 the last (`value_at`).
+    update, place 1 the last. The types are in common/flags.py: what each flag takes, and whether a policy decides it.
     """
 
     # experiment
     exp_name: str = Path(__file__).stem  # the name of this experiment
-    seed: int = 1  # seed of the experiment
-    recipe: str = "ours"  # what the flags that are not typed are: "paper" (these values) or "ours" (RECIPES first)
+    seed: flags.Natural = 1  # seed of the experiment
+    recipe: flags.Recipe = "ours"  # what the untyped flags are: "paper" (these values) or "ours" (RECIPES first)
     torch_deterministic: bool = True  # if toggled, `torch.backends.cudnn.deterministic=True`
     cuda: bool = True  # if toggled, a GPU is used when there is one
-    num_threads: int = 1  # CPU threads of torch (0: torch's own choice); the bits of the results depend on it
+    num_threads: flags.Threads = 1  # CPU threads of torch (0: torch's own choice); the bits of the results depend on it
     torch_compile: bool = False  # compile the network (on a GPU: CUDA graphs), for a slower start and faster updates
     track: bool = False  # if toggled, this experiment will be tracked with Weights and Biases
     wandb_project_name: str = "ppo-gtrxl"  # the wandb's project name
@@ -62,48 +64,52 @@ class Args:
     checkpoint: str | None = None  # start from these weights (.safetensors)
     resume: str | None = None  # go on with the interrupted run in this run folder, bit for bit
     eval_only: bool = False  # fly the mean action of --checkpoint, train nothing, write only --eval-json and --eval-npz
-    eval_starts: int | None = None  # number of evaluation starts (default 1000; 50 in a training cut short)
-    eval_seed: int = 0  # seed of the evaluation starts
+    eval_starts: flags.Starts | None = None  # number of evaluation starts (default 1000; 50 in a training cut short)
+    eval_seed: flags.Natural = 0  # seed of the evaluation starts
     eval_json: str | None = None  # where --eval-only writes the metrics
     eval_npz: str | None = None  # where --eval-only writes the trajectories
-    eval_every: int = 10  # updates between two evaluations, which have their own starts (0: only at the end)
+    eval_every: flags.Natural = 10  # updates between two evaluations, which have their own starts (0: only at the end)
 
     # environment
     env_id: str = "DoubleIntegrator-v0"  # the id of the environment, one of ENV_IDS
-    observe_phase: bool = True  # show time and phase to the policy
-    observe_velocity: bool = True  # show the velocity to the policy
+    observe_phase: flags.Observed = True  # show time and phase to the policy
+    observe_velocity: flags.Observed = True  # show the velocity to the policy
 
     # Table 1
-    num_blocks: int = 3  # number of GTrXL blocks (0: a plain MLP, without memory)
-    embed_dim: int = 128  # embedding dimension d
-    num_heads: int = 2  # number of attention heads
-    memory_length: int = 32  # memory length L: a step attends to itself and the L steps before it
-    mlp_dim: int = 128  # width of the position-wise MLP
-    hidden_dim: int = 128  # width of the hidden layer of each head
-    gamma: float = 0.99  # the discount factor gamma
-    gae_lambda: Schedule = 0.95  # the lambda for the general advantage estimation
-    total_updates: int = 1000  # number of updates
-    update_epochs: int = 8  # the K epochs to update the policy
-    vf_coef: float = 0.2  # coefficient of the value function
-    learning_rate: Schedule = "0:3e-4 1:3e-5"  # the learning rate of the optimizer
-    ent_coef: Schedule = "0:1e-3 1:1e-4"  # coefficient of the entropy
-    clip_coef: float = 0.2  # the surrogate clipping coefficient
+    num_blocks: flags.Blocks = 3  # number of GTrXL blocks (0: a plain MLP, without memory)
+    embed_dim: flags.Width = 128  # embedding dimension d
+    num_heads: flags.Width = 2  # number of attention heads
+    memory_length: flags.Length = 32  # memory length L: a step attends to itself and the L steps before it
+    mlp_dim: flags.Width = 128  # width of the position-wise MLP
+    hidden_dim: flags.Width = 128  # width of the hidden layer of each head
+    gamma: flags.Share = 0.99  # the discount factor gamma
+    gae_lambda: flags.ShareSchedule = Schedule(0.95)  # the lambda for the general advantage estimation
+    total_updates: flags.Count = 1000  # number of updates
+    update_epochs: flags.Count = 8  # the K epochs to update the policy
+    vf_coef: flags.Weight = 0.2  # coefficient of the value function
+    learning_rate: flags.ShareSchedule = Schedule("0:3e-4 1:3e-5")  # the learning rate of the optimizer
+    ent_coef: flags.WeightSchedule = Schedule("0:1e-3 1:1e-4")  # coefficient of the entropy
+    clip_coef: flags.Share = 0.2  # the surrogate clipping coefficient
 
     # not in Table 1: our choice
-    num_envs: int = 80  # parallel environments, one episode each per update (256 steps of 16 workers, a guess)
-    num_minibatches: int = 4  # the number of mini-batches of whole episodes
+    num_envs: flags.Count = 80  # parallel environments, one episode each per update (256 steps of 16 workers, a guess)
+    num_minibatches: flags.Count = 4  # the number of mini-batches of whole episodes
     norm_adv: bool = True  # normalise the advantages over an update
-    max_grad_norm: float = 0.5  # the maximum norm for the gradient clipping
-    target_kl: float | None = None  # the KL divergence from which an update takes no further step (None: no limit)
-    log_std: Schedule = 0.0  # log of the std in the action's unit. A number: learned from there; points: not learned
-    memory_noise: Schedule = 0.1  # std of the memory before an episode (Algorithm 1, line 5; the text says "small")
-    reward_scale: float = 1.0  # factor on the rewards in training; losses are logged with it, returns without
+    max_grad_norm: flags.Positive = 0.5  # the maximum norm for the gradient clipping
+    target_kl: flags.Positive | None = None  # the KL divergence at which an update takes no further step (None: never)
+    log_std: flags.LogStd = Schedule(0.0)  # log of the action's std. A number: learned from there; points: not learned
+    memory_noise: flags.ShareSchedule = Schedule(0.1)  # std of the memory before an episode (Algorithm 1, line 5)
+    reward_scale: flags.Positive = 1.0  # factor on the rewards in training; losses are logged with it, returns without
 
     # ours: off here, on in RECIPES
     lr_times_std: bool = False  # the learning rate is --learning-rate times the policy's std
-    flights_per_start: Schedule = 1  # flights of each start, compared with one another
-    log_radius: Schedule = 0.0  # waypoints: log of the training radius in target radii
-    weight_average: float = 0.0  # decay, per optimiser step, of the averaged weights used in evaluation
+    flights_per_start: flags.CountSchedule = Schedule(1)  # flights of each start, compared with one another
+    # waypoints: log of the training radius in target radii
+    log_radius: Annotated[Schedule, flags.Range(-5.0, 14.0)] = Schedule(0.0)
+    weight_average: flags.Decay = 0.0  # decay, per optimiser step, of the averaged weights used in evaluation
+
+    def __post_init__(self):
+        flags.parse_schedules(self)
 
 
 # Recipes: the values that we replace (docs/decisions.md has Table 1's beside them, docs/method.md the reasons) --------
@@ -152,8 +158,12 @@ def recipe(args):
 ENV_IDS = ("DoubleIntegrator-v0", "DoubleIntegratorWaypoints-v0")
 ENV_OPTIONS = ("observe_phase", "observe_velocity")  # arguments of the environments
 FIXED_OPTIONS = {"scaled_action": True}  # arguments that no flag sets
-BUFFERS = ForEachId(ENV_IDS, runs.observation_scale)  # by environment id; `features` reads them as agent.<name>
 INITIAL_ACTION = [0.0]  # the policy's output before training, in units of the bound
+
+
+def constants(env_id):
+    """The buffers of an environment's agents, saved with the weights; `features` reads them as agent.<name>."""
+    return {"observation_scale": runs.observation_scale(env_id)}
 
 
 def features(agent, obs):
@@ -193,11 +203,11 @@ def curriculum(args, progress):
     miss saves 4 or 12 for each unit (`circle_price` of baselines.py), so it does not pay. A steeper fall would hide
     the cost.
     """
-    group = round(value_at(args.flights_per_start, progress))
+    group = round(args.flights_per_start.at(progress))
     training = {"flights_per_start": group}
     problem = PROBLEMS.get(args.env_id)
     if problem and problem.circles_count:
-        training["radius_scale"] = math.exp(value_at(args.log_radius, progress))
+        training["radius_scale"] = math.exp(args.log_radius.at(progress))
         training["bonus_width"] = BONUS_WIDTH if group > 1 else 0.0
     return training
 
@@ -367,9 +377,9 @@ class Agent(nn.Module):
         self.memory_length = args.memory_length
         self.embed_dim = d
 
-        # buffers of the problem, saved with the weights; `features` and `mean_action` read them as agent.<name>
-        constants = {**BUFFERS[args.env_id], "action_scale": envs.single_action_space.high.tolist()}
-        for name, value in constants.items():
+        # saved with the weights; `features` and `mean_action` read them as agent.<name>
+        buffers = {**constants(args.env_id), "action_scale": envs.single_action_space.high.tolist()}
+        for name, value in buffers.items():
             self.register_buffer(name, torch.tensor(value))
         any_observation = torch.ones(envs.single_observation_space.shape)  # only the number of its features is used
         inputs = len(features(self, any_observation))
@@ -380,8 +390,8 @@ class Agent(nn.Module):
         self.actor = nn.Sequential(linear(d, hidden, gain=2**0.5), nn.GELU(), linear(hidden, actions, gain=0.01))
         self.actor[-1].bias.data[:] = torch.tensor(INITIAL_ACTION)
         self.critic = nn.Sequential(linear(d, hidden, gain=2**0.5), nn.GELU(), linear(hidden, 1))
-        learned = not isinstance(args.log_std, str)  # a number is where learning begins; points are set
-        self.actor_logstd = nn.Parameter(torch.full((actions,), value_at(args.log_std, 0.0)), requires_grad=learned)
+        learned = not args.log_std.has_points  # a number is where learning begins; points are set
+        self.actor_logstd = nn.Parameter(torch.full((actions,), args.log_std.at(0.0)), requires_grad=learned)
 
     def new_memory(self, num_envs, noise):
         """m_0 ~ N(0, noise^2), drawn once per episode and block: (blocks, N, L, d)."""
@@ -600,20 +610,6 @@ def ppo_gradient(args, agent, batch, mb, ent_coef):
 
 
 # Shared, ours: what we add to PPO -------------------------------------------------------------------------------------
-def value_at(schedule, progress):
-    """The value of a schedule at `progress`, which is 0 in the first update and 1 in the last.
-
-    A number is constant. Points "0:-1 0.4:-2 1:-6" are joined by lines. If two points have one place, the second counts
-    from there on.
-    """
-    if not isinstance(schedule, str):
-        return float(schedule)
-    points = [point.split(":") for point in schedule.split()]
-    places = [float(place) for place, _ in points]
-    values = [float(value) for _, value in points]
-    return float(np.interp(progress, places, values))
-
-
 def set_log_std(agent, args, progress):
     """Set the log-std of this update if --log-std is a schedule. Clamp it if it is learned.
 
@@ -622,7 +618,7 @@ def set_log_std(agent, args, progress):
     if agent.actor_logstd.requires_grad:
         agent.actor_logstd.data.clamp_(*LOG_STD_RANGE)
     else:
-        agent.actor_logstd.data.fill_(value_at(args.log_std, progress))
+        agent.actor_logstd.data.fill_(args.log_std.at(progress))
 
 
 def learning_rate_of(agent, args, progress):
@@ -633,7 +629,7 @@ def learning_rate_of(agent, args, progress):
     learning rate is in proportion to the std, a step changes the policy by about the same KL at any noise, and the
     policy still learns when the noise is small.
     """
-    learning_rate = value_at(args.learning_rate, progress)
+    learning_rate = args.learning_rate.at(progress)
     if not args.lr_times_std:
         return learning_rate
     return learning_rate * agent.actor_logstd.exp().mean().item()
@@ -715,9 +711,9 @@ def train(args, agent, average, optimizer, envs, run, gradient=ppo_gradient):
     target_kl = math.inf if args.target_kl is None else args.target_kl
     for iteration in range(run.updates_done + 1, args.total_updates + 1):  # line 2
         progress = (iteration - 1) / max(args.total_updates - 1, 1)
-        memory_noise = value_at(args.memory_noise, progress)
-        gae_lambda = value_at(args.gae_lambda, progress)
-        ent_coef = value_at(args.ent_coef, progress)
+        memory_noise = args.memory_noise.at(progress)
+        gae_lambda = args.gae_lambda.at(progress)
+        ent_coef = args.ent_coef.at(progress)
         set_log_std(agent, args, progress)
         learning_rate = learning_rate_of(agent, args, progress)
         optimizer.param_groups[0]["lr"] = learning_rate
@@ -757,7 +753,7 @@ def train(args, agent, average, optimizer, envs, run, gradient=ppo_gradient):
 
 def main(argv):
     """Train and evaluate, or with --eval-only evaluate, by the flags `argv`."""
-    args, saved = runs.parse_args(Args, recipe, argv, ENV_OPTIONS, BUFFERS)
+    args, saved = runs.parse_args(sys.modules[__name__], argv)
     device = runs.prepare_torch(args)
     env_options = {name: getattr(args, name) for name in ENV_OPTIONS} | FIXED_OPTIONS
     envs = runs.make_envs(args, env_options)

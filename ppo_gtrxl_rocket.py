@@ -23,9 +23,10 @@ rocket/rewards.py. Here R_trajectory has no weight. R_guidance counts only with 
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -36,12 +37,15 @@ from torch.distributions import Normal
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 import runs
+from common import flags
 from common.flying import fly_until_ended
+from common.schedule import Schedule
 from cuda_graphs import speed_up
 from envs import ROCKETS
+from rocket.failure import FAILURE_TIMES
 from rocket.policy_constants import DIFFERENCES, WIDE_DIFFERENCES, policy_constants
 from rocket.rewards import TERMINAL_SCALE, mass_rewards
-from runs import Numbers, Schedule
+from runs import Numbers
 
 
 @dataclass
@@ -50,16 +54,16 @@ class Args:
 
     --recipe paper uses these values. --recipe ours, the default, first replaces those that RECIPES names. A flag that
     is typed wins over both. A Schedule is one number, or points "place:value place:value ...". Place 0 is the first
-    update, place 1 the last (`value_at`).
+    update, place 1 the last. The types are in common/flags.py: what each flag takes, and whether a policy decides it.
     """
 
     # experiment
     exp_name: str = Path(__file__).stem  # the name of this experiment
-    seed: int = 1  # seed of the experiment
-    recipe: str = "ours"  # what the flags that are not typed are: "paper" (these values) or "ours" (RECIPES first)
+    seed: flags.Natural = 1  # seed of the experiment
+    recipe: flags.Recipe = "ours"  # what the untyped flags are: "paper" (these values) or "ours" (RECIPES first)
     torch_deterministic: bool = True  # if toggled, `torch.backends.cudnn.deterministic=True`
     cuda: bool = True  # if toggled, a GPU is used when there is one
-    num_threads: int = 1  # CPU threads of torch (0: torch's own choice); the bits of the results depend on it
+    num_threads: flags.Threads = 1  # CPU threads of torch (0: torch's own choice); the bits of the results depend on it
     torch_compile: bool = False  # compile the network (on a GPU: CUDA graphs), for a slower start and faster updates
     track: bool = False  # if toggled, this experiment will be tracked with Weights and Biases
     wandb_project_name: str = "ppo-gtrxl"  # the wandb's project name
@@ -69,54 +73,61 @@ class Args:
     checkpoint: str | None = None  # start from these weights (.safetensors)
     resume: str | None = None  # go on with the interrupted run in this run folder, bit for bit
     eval_only: bool = False  # fly the mean action of --checkpoint, train nothing, write only --eval-json and --eval-npz
-    eval_starts: int | None = None  # number of drawn evaluation flights (default 1705; 100 in a training cut short)
-    eval_seed: int = 0  # seed of the evaluation starts
+    eval_starts: flags.Starts | None = None  # number of drawn flights (default 1705; 100 in a training cut short)
+    eval_seed: flags.Natural = 0  # seed of the evaluation starts
     eval_json: str | None = None  # where --eval-only writes the metrics
     eval_npz: str | None = None  # where --eval-only writes the trajectories
-    eval_every: int = 5  # updates between two evaluations, which have their own draws (0: only at the end)
+    eval_every: flags.Natural = 5  # updates between two evaluations, which have their own draws (0: only at the end)
 
     # environment
     env_id: str = "RocketAscent-v0"  # the id of the environment, one of ENV_IDS
-    observe_phase: bool = True  # show time and phase to the policy
-    dispersion: float = 0.0  # spread of the drawn vehicles, as a factor on `envs.Dispersion` (0: all are nominal)
-    observe_draw: bool = False  # show the drawn vehicle to the policy, which no real flight could know
-    observe_mass: bool = False  # show the true mass of a drawn rocket, not the flight computer's estimate
-    failure: float = 0.0  # in half of the flights one group of engines loses up to this share (with cut-off)
-    failure_time: str = "random"  # when thrust is lost: at a "random" moment or at the last stage's "ignition"
+    observe_phase: flags.Observed = True  # show time and phase to the policy
+    # spread of the drawn vehicles, as a factor on `envs.Dispersion` (0: all are nominal)
+    dispersion: Annotated[float, flags.Range(0.0, 10.0)] = 0.0
+    observe_draw: flags.Observed = False  # show the drawn vehicle to the policy, which no real flight could know
+    observe_mass: flags.Observed = False  # show the true mass of a drawn rocket, not the flight computer's estimate
+    # in half of the flights one group of engines loses up to this share (with cut-off)
+    failure: Annotated[float, flags.Range(0.0, 0.3)] = 0.0
+    # when thrust is lost: at a "random" moment or at the last stage's "ignition"
+    failure_time: Annotated[str, flags.Words(FAILURE_TIMES), flags.Policy.SUGGESTS] = "random"
     navigation_noise: Numbers = None  # standard deviations, m and m/s, of the observed position and velocity
 
     # Table 1
-    num_blocks: int = 6  # number of GTrXL blocks (0: a plain MLP, without memory)
-    embed_dim: int = 384  # embedding dimension d
-    num_heads: int = 8  # number of attention heads
-    memory_length: int = 256  # memory length L: a step attends to itself and the L steps before it
-    mlp_dim: int = 384  # width of the position-wise MLP
-    hidden_dim: int = 384  # width of the hidden layer of each head
-    gamma: float = 0.99  # the discount factor gamma
-    gae_lambda: Schedule = 0.95  # the lambda for the general advantage estimation
-    total_updates: int = 5000  # number of updates
-    update_epochs: int = 16  # the K epochs to update the policy
-    vf_coef: float = 0.8  # coefficient of the value function
-    learning_rate: Schedule = "0:1e-4 1:5e-6"  # the learning rate of the optimizer
-    ent_coef: Schedule = "0:1e-3 1:1e-4"  # coefficient of the entropy
-    clip_coef: float = 0.12  # the surrogate clipping coefficient
+    num_blocks: flags.Blocks = 6  # number of GTrXL blocks (0: a plain MLP, without memory)
+    embed_dim: flags.Width = 384  # embedding dimension d
+    num_heads: flags.Width = 8  # number of attention heads
+    memory_length: flags.Length = 256  # memory length L: a step attends to itself and the L steps before it
+    mlp_dim: flags.Width = 384  # width of the position-wise MLP
+    hidden_dim: flags.Width = 384  # width of the hidden layer of each head
+    gamma: flags.Share = 0.99  # the discount factor gamma
+    gae_lambda: flags.ShareSchedule = Schedule(0.95)  # the lambda for the general advantage estimation
+    total_updates: flags.Count = 5000  # number of updates
+    update_epochs: flags.Count = 16  # the K epochs to update the policy
+    vf_coef: flags.Weight = 0.8  # coefficient of the value function
+    learning_rate: flags.ShareSchedule = Schedule("0:1e-4 1:5e-6")  # the learning rate of the optimizer
+    ent_coef: flags.WeightSchedule = Schedule("0:1e-3 1:1e-4")  # coefficient of the entropy
+    clip_coef: flags.Share = 0.12  # the surrogate clipping coefficient
 
     # not in Table 1: our choice
-    num_envs: int = 32  # parallel environments, one episode each per update
-    num_minibatches: int = 8  # the number of mini-batches of whole episodes
+    num_envs: flags.Count = 32  # parallel environments, one episode each per update
+    num_minibatches: flags.Count = 8  # the number of mini-batches of whole episodes
     norm_adv: bool = True  # normalise the advantages over an update
-    max_grad_norm: float = 0.5  # the maximum norm for the gradient clipping
-    target_kl: float | None = None  # the KL divergence from which an update takes no further step (None: no limit)
-    log_std: Schedule = -1.4  # log of the std in the action's unit. A number: learned from there; points: not learned
-    memory_noise: Schedule = 0.1  # std of the memory before an episode (Algorithm 1, line 5; the text says "small")
-    reward_scale: float = 0.2  # factor on the rewards in training; losses are logged with it, returns without
+    max_grad_norm: flags.Positive = 0.5  # the maximum norm for the gradient clipping
+    target_kl: flags.Positive | None = None  # the KL divergence at which an update takes no further step (None: never)
+    log_std: flags.LogStd = Schedule(-1.4)  # log of the action's std. A number: learned from there; points: not learned
+    memory_noise: flags.ShareSchedule = Schedule(0.1)  # std of the memory before an episode (Algorithm 1, line 5)
+    reward_scale: flags.Positive = 0.2  # factor on the rewards in training; losses are logged with it, returns without
 
     # ours: off here, on in RECIPES
     lr_times_std: bool = False  # the learning rate is --learning-rate times the policy's std
-    flights_per_start: Schedule = 1  # flights of each start or draw, compared with one another
+    flights_per_start: flags.CountSchedule = Schedule(1)  # flights of each start or draw, compared with one another
     guidance: bool = False  # pay R_guidance, which the paper names and we give a formula (rocket/rewards.py)
-    mass_weight: Schedule = 0.0  # factor on `mass_rewards`, where the engine cuts off at the target's energy
-    weight_average: float = 0.0  # decay, per optimiser step, of the averaged weights used in evaluation
+    # factor on `mass_rewards`, where the engine cuts off at the target's energy
+    mass_weight: flags.WeightSchedule = Schedule(0.0)
+    weight_average: flags.Decay = 0.0  # decay, per optimiser step, of the averaged weights used in evaluation
+
+    def __post_init__(self):
+        flags.parse_schedules(self)
 
 
 # Recipes: the values that we replace (docs/decisions.md has Table 1's beside them, docs/method.md the reasons) --------
@@ -180,10 +191,11 @@ def has_draws(args):
     return bool(args.dispersion or args.failure)
 
 
-def recipe(args):
+def recipe(args, anew=False):
     """What our recipe changes for the environments of `args`. An id without a recipe takes CUTOFF or FIXED.
 
-    With draws, training begins with --checkpoint or with the policy that is shipped for the id.
+    With draws, training begins with --checkpoint or with the policy that is shipped for the id. `anew` leaves the
+    shipped policy out.
     """
     family = CUTOFF if ROCKETS[args.env_id].cutoff else FIXED
     changes = RECIPES.get(args.env_id, family)
@@ -193,7 +205,9 @@ def recipe(args):
     shipped = dict(FIRST_POLICY)
     if args.failure:
         shipped |= FIRST_OF_FAILING
-    first_policy = shipped.get(args.env_id) if args.checkpoint is None else args.checkpoint
+    if anew:
+        shipped = {}
+    first_policy = args.checkpoint or shipped.get(args.env_id)
     if not first_policy:
         flag = "--dispersion" if args.dispersion else "--failure"
         todo = f"train without {flag} first, and name that policy by --checkpoint"
@@ -209,11 +223,15 @@ ENV_OPTIONS = (  # arguments of the environments
     "observe_phase", "dispersion", "observe_draw", "observe_mass", "failure", "failure_time", "navigation_noise",
 )  # fmt: skip
 FIXED_OPTIONS = {"action_frame": "local"}  # arguments that no flag sets; local is up, along-track, cross-track
-BUFFERS = {env_id: policy_constants(mission.rocket) for env_id, mission in ROCKETS.items()}  # read as agent.<name>
 INITIAL_ACTION = [1.0, 0.0, 0.0]  # straight up (local frame), since a randomly steered rocket never leaves the ground
 OBSERVED = 9  # numbers that every rocket shows: r, v, m, t_norm, phase; the draw comes after them
 LENGTH = 64  # in 100 km, about the Earth's radius
 SPEED = 8  # in km/s, about the circular speed at that radius
+
+
+def constants(env_id):
+    """The buffers of an environment's agents, saved with the weights; `features` reads them as agent.<name>."""
+    return policy_constants(ROCKETS[env_id].rocket)
 
 
 class Motion(NamedTuple):
@@ -313,12 +331,12 @@ def curriculum(args, progress):
     hardest to save, and rare among random ones.
     """
     training = {
-        "flights_per_start": round(value_at(args.flights_per_start, progress)),
+        "flights_per_start": round(args.flights_per_start.at(progress)),
         "guidance": args.guidance,
         "terminal_scale": TERMINAL_SCALE,
     }
-    if isinstance(args.log_std, str):
-        std = math.exp(value_at(args.log_std, progress))
+    if args.log_std.has_points:
+        std = math.exp(args.log_std.at(progress))
         smallest = 0.001 if has_draws(args) else 0.0
         training["terminal_scale"] = min(TERMINAL_SCALE, max(std / 8, smallest))
     if args.failure and args.failure_time == "random":
@@ -329,7 +347,7 @@ def curriculum(args, progress):
 
 def add_rewards(args, progress, training, envs, batch, episodes):
     """With cut-off, add `mass_rewards` to the flights' last steps."""
-    weight = value_at(args.mass_weight, progress)
+    weight = args.mass_weight.at(progress)
     if not envs.cutoff or weight == 0:
         return
     compared_flights = runs.gathered(episodes)  # of all processes
@@ -598,9 +616,9 @@ class Agent(nn.Module):
         self.memory_length = args.memory_length
         self.embed_dim = d
 
-        # buffers of the problem, saved with the weights; `features` and `mean_action` read them as agent.<name>
-        constants = {**BUFFERS[args.env_id], "action_scale": envs.single_action_space.high.tolist()}
-        for name, value in constants.items():
+        # saved with the weights; `features` and `mean_action` read them as agent.<name>
+        buffers = {**constants(args.env_id), "action_scale": envs.single_action_space.high.tolist()}
+        for name, value in buffers.items():
             self.register_buffer(name, torch.tensor(value))
         any_observation = torch.ones(envs.single_observation_space.shape)  # only the number of its features is used
         inputs = len(features(self, any_observation))
@@ -611,8 +629,8 @@ class Agent(nn.Module):
         self.actor = nn.Sequential(linear(d, hidden, gain=2**0.5), nn.GELU(), linear(hidden, actions, gain=0.01))
         self.actor[-1].bias.data[:] = torch.tensor(INITIAL_ACTION)
         self.critic = nn.Sequential(linear(d, hidden, gain=2**0.5), nn.GELU(), linear(hidden, 1))
-        learned = not isinstance(args.log_std, str)  # a number is where learning begins; points are set
-        self.actor_logstd = nn.Parameter(torch.full((actions,), value_at(args.log_std, 0.0)), requires_grad=learned)
+        learned = not args.log_std.has_points  # a number is where learning begins; points are set
+        self.actor_logstd = nn.Parameter(torch.full((actions,), args.log_std.at(0.0)), requires_grad=learned)
 
     def new_memory(self, num_envs, noise):
         """m_0 ~ N(0, noise^2), drawn once per episode and block: (blocks, N, L, d)."""
@@ -831,20 +849,6 @@ def ppo_gradient(args, agent, batch, mb, ent_coef):
 
 
 # Shared, ours: what we add to PPO -------------------------------------------------------------------------------------
-def value_at(schedule, progress):
-    """The value of a schedule at `progress`, which is 0 in the first update and 1 in the last.
-
-    A number is constant. Points "0:-1 0.4:-2 1:-6" are joined by lines. If two points have one place, the second counts
-    from there on.
-    """
-    if not isinstance(schedule, str):
-        return float(schedule)
-    points = [point.split(":") for point in schedule.split()]
-    places = [float(place) for place, _ in points]
-    values = [float(value) for _, value in points]
-    return float(np.interp(progress, places, values))
-
-
 def set_log_std(agent, args, progress):
     """Set the log-std of this update if --log-std is a schedule. Clamp it if it is learned.
 
@@ -853,7 +857,7 @@ def set_log_std(agent, args, progress):
     if agent.actor_logstd.requires_grad:
         agent.actor_logstd.data.clamp_(*LOG_STD_RANGE)
     else:
-        agent.actor_logstd.data.fill_(value_at(args.log_std, progress))
+        agent.actor_logstd.data.fill_(args.log_std.at(progress))
 
 
 def learning_rate_of(agent, args, progress):
@@ -864,7 +868,7 @@ def learning_rate_of(agent, args, progress):
     learning rate is in proportion to the std, a step changes the policy by about the same KL at any noise, and the
     policy still learns when the noise is small.
     """
-    learning_rate = value_at(args.learning_rate, progress)
+    learning_rate = args.learning_rate.at(progress)
     if not args.lr_times_std:
         return learning_rate
     return learning_rate * agent.actor_logstd.exp().mean().item()
@@ -946,9 +950,9 @@ def train(args, agent, average, optimizer, envs, run, gradient=ppo_gradient):
     target_kl = math.inf if args.target_kl is None else args.target_kl
     for iteration in range(run.updates_done + 1, args.total_updates + 1):  # line 2
         progress = (iteration - 1) / max(args.total_updates - 1, 1)
-        memory_noise = value_at(args.memory_noise, progress)
-        gae_lambda = value_at(args.gae_lambda, progress)
-        ent_coef = value_at(args.ent_coef, progress)
+        memory_noise = args.memory_noise.at(progress)
+        gae_lambda = args.gae_lambda.at(progress)
+        ent_coef = args.ent_coef.at(progress)
         set_log_std(agent, args, progress)
         learning_rate = learning_rate_of(agent, args, progress)
         optimizer.param_groups[0]["lr"] = learning_rate
@@ -989,7 +993,7 @@ def train(args, agent, average, optimizer, envs, run, gradient=ppo_gradient):
 
 def main(argv):
     """Train and evaluate, or with --eval-only evaluate, by the flags `argv`."""
-    args, saved = runs.parse_args(Args, recipe, argv, ENV_OPTIONS, BUFFERS)
+    args, saved = runs.parse_args(sys.modules[__name__], argv)
     device = runs.prepare_torch(args)
     env_options = {name: getattr(args, name) for name in ENV_OPTIONS} | FIXED_OPTIONS
     envs = runs.make_envs(args, env_options)

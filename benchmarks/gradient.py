@@ -26,7 +26,7 @@ import math
 import os
 import sys
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
 from typing import NamedTuple
@@ -47,6 +47,7 @@ from common.checkpoints import read_checkpoint
 from common.command_line import OneLineParser, integer, output_file
 from common.evaluations import read_json
 from common.files import write_bytes, write_json
+from common.flags import plain_args
 from common.flying import decision_us, fly_until_ended
 from common.integration import rk4
 from common.tasks import task_of
@@ -483,8 +484,7 @@ def new_agent(row: Row, seed: int):
     """A script's agent, without blocks unless the row has a memory, and its arguments."""
     script = row.script
     args = row.script.Args(env_id=row.env_id, seed=seed)
-    for name, value in script.recipe(args).items():
-        setattr(args, name, value)
+    args = replace(args, **script.recipe(args))
     if not row.has_memory:
         args.num_blocks = 0
     torch.manual_seed(seed)
@@ -522,7 +522,7 @@ def policy_file(agent, args, curve: Curve, recipe: Recipe) -> bytes:
     seconds = 60 * curve.points[-1]["minutes"]
     counters = {"seed": args.seed, "total_updates": recipe.updates, "global_step": 0}
     counters |= {"training_seconds": seconds, "wall_seconds": seconds}
-    metadata = {"env_id": args.env_id, "args": json.dumps(asdict(args)), **counters}
+    metadata = {"env_id": args.env_id, "args": json.dumps(plain_args(args)), **counters}
     return safetensors.torch.save(agent.float().state_dict(), {key: str(value) for key, value in metadata.items()})
 
 

@@ -29,7 +29,7 @@ def paid(episodes, progress=0.4, env_id=ENV_ID, flying=N, **flags):
     """The rewards (T, flying) that `add_rewards` adds; flight k lives k + 1 steps."""
     args = script.Args(**{**script.RECIPES[ENV_ID], "env_id": env_id, "num_envs": flying, **flags})
     envs = gym.make_vec(env_id, num_envs=flying, dispersion=args.dispersion).unwrapped
-    training = {"flights_per_start": args.flights_per_start, "terminal_scale": 0.002}
+    training = {"flights_per_start": round(args.flights_per_start.at(0.0)), "terminal_scale": 0.002}
     alive = (torch.arange(flying)[:, None] <= torch.arange(flying)).float()
     rewards = torch.zeros(flying, flying)
     batch = script.Batch(*[torch.zeros(0)] * 3, rewards, torch.zeros(0), alive, torch.zeros(0))

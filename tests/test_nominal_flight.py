@@ -10,7 +10,6 @@ import torch
 
 import ppo_gtrxl_rocket as script
 from envs import ROCKETS, Burn, register_rocket, target_axes, target_orbit
-from rocket.policy_constants import policy_constants
 
 CUTOFF = "RocketAscentCutoff-v0"
 SMALL = {"embed_dim": 8, "num_heads": 2, "mlp_dim": 8, "hidden_dim": 8, "num_blocks": 1, "memory_length": 4}
@@ -219,7 +218,6 @@ def test_in_a_coast_flights_are_compared_with_its_beginning():
     first, second = two_stages.burns
     burns = (first, Burn(300.0, second.engines), Burn(600.0, ()), Burn(693.0, second.engines))
     register_rocket("Restart-v0", replace(two_stages, burns=burns, end_time=693.0), cutoff=True)
-    script.BUFFERS["Restart-v0"] = policy_constants(ROCKETS["Restart-v0"].rocket)
     try:
         agent, *_ = make_agent(env_id="Restart-v0")
         envs = gym.make_vec("Restart-v0", num_envs=1, action_frame="local")
@@ -233,5 +231,5 @@ def test_in_a_coast_flights_are_compared_with_its_beginning():
         np.testing.assert_array_equal(found, coast[:1, 2:].expand(5, -1))
         np.testing.assert_allclose(coast[:, 2:9], coast[:1, 2:9].expand(len(coast), -1), atol=2e-6)
     finally:
-        for registry in (script.BUFFERS, ROCKETS, gym.registry):
+        for registry in (ROCKETS, gym.registry):
             del registry["Restart-v0"]

@@ -30,7 +30,7 @@ def between(first, last, update):
 
 def fly(agent, envs, args):
     """One episode in each environment: the memory before them, and for each a list of (obs, action, log pi, V, r)."""
-    memory = agent.new_memory(envs.num_envs, args.memory_noise)
+    memory = agent.new_memory(envs.num_envs, args.memory_noise.at(0.0))
     episodes = [[] for _ in range(envs.num_envs)]
     flying = set(range(envs.num_envs))
     obs, _ = envs.reset()
@@ -57,7 +57,7 @@ def advantages_of(episode, args):
     next_value = next_advantage = 0.0
     for _, _, _, value, reward in reversed(episode):
         delta = reward + args.gamma * next_value - value
-        advantage = delta + args.gamma * args.gae_lambda * next_advantage
+        advantage = delta + args.gamma * args.gae_lambda.at(0.0) * next_advantage
         advantages.insert(0, advantage)
         next_value = value
         next_advantage = advantage

@@ -17,6 +17,7 @@ from scipy.stats import norm
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 import ppo_gtrxl_di as script
+from common.schedule import Schedule
 
 torch.set_num_threads(1)
 TINY = {"embed_dim": 8, "num_heads": 2, "mlp_dim": 8, "hidden_dim": 8, "num_blocks": 1, "memory_length": 4}
@@ -50,7 +51,7 @@ class Learner:
 
     def __init__(self, envs, **changes):
         self.args, self.envs = make_args(**changes), envs
-        envs.flights_per_start = self.args.flights_per_start
+        envs.flights_per_start = round(self.args.flights_per_start.at(0.0))
         self.agent = make_agent(self.args, envs)
         self.average = AveragedModel(self.agent, multi_avg_fn=get_ema_multi_avg_fn(0.9))
         self.optimizer = RecordingAdam(self.agent)
@@ -113,12 +114,36 @@ def test_gae_is_the_direct_sum(gamma, lam):
 
 def test_schedule_is_linear_between_its_points():
     """Of two points at one place the second counts from there on; before the first and after the last: constant."""
-    schedule = "0.1:1 0.4:-2 0.4:8 0.9:3"
+    schedule = Schedule("0.1:1 0.4:-2 0.4:8 0.9:3")
     expected = {0.0: 1, 0.1: 1, 0.2: 0, 0.3: -1, 0.399: -1.99, 0.4: 8, 0.65: 5.5, 0.9: 3, 1.0: 3}
     for progress, value in expected.items():
-        assert script.value_at(schedule, progress) == pytest.approx(value), progress
-    assert script.value_at("0:3e-4 1:3e-5", 0.0) == 3e-4 and script.value_at("0:3e-4 1:3e-5", 1.0) == 3e-5
-    assert script.value_at(0.7, 0.3) == 0.7
+        assert schedule.at(progress) == pytest.approx(value), progress
+    updates = 21
+    found = schedule.over(updates)
+    np.testing.assert_array_equal(found, [schedule.at(k / (updates - 1)) for k in range(updates)])
+    assert Schedule("0:3e-4 1:3e-5").at(0.0) == 3e-4 and Schedule("0:3e-4 1:3e-5").at(1.0) == 3e-5
+    assert Schedule(0.7).at(0.3) == 0.7
+
+
+@pytest.mark.parametrize("plain", [1, 0.95, -1.4, 3e-4, "0:3e-4 1:3e-5", "0:-1"])
+def test_a_file_holds_a_schedule_as_number_or_words(plain):
+    """Read again it is the same schedule. One point is not a number: it is set where a number is learned."""
+    schedule = Schedule(plain)
+    assert schedule.plain == plain and type(schedule.plain) is type(plain)
+    assert Schedule(schedule.plain) == Schedule(str(schedule)) == Schedule(schedule) == schedule
+    assert schedule.has_points == (":" in str(plain))
+    assert Schedule("0:-1") != Schedule(-1) and Schedule(1) == Schedule(1.0)
+
+
+@pytest.mark.parametrize("words", ["", "x", "0:1 x", "0.5:1 0:2", "0:1 2:3", "-0.1:1", "nan:1", "0:1:2", "1 2"])
+def test_words_that_are_no_schedule(words):
+    with pytest.raises(ValueError, match=f"^{words}: must be a number, or points as 0:-1 0.4:-2 1:-6 whose places ris"):
+        Schedule(words)
+
+
+def test_a_lowered_group_keeps_its_places():
+    assert str(Schedule("0:1 0.4:1 0.4:8").replaced(8, 4)) == "0:1 0.4:1 0.4:4"
+    assert Schedule(32).replaced(32, 4) == Schedule(4)
 
 
 @pytest.mark.parametrize("name, env_id, first", [
@@ -129,7 +154,7 @@ def test_radius_curriculum(name, env_id, first):
     """From about K times the radius, geometrically, to the true one; from there on a tenth less, flown in groups."""
     script = importlib.import_module(name)
     args = script.Args(env_id=env_id, **script.RECIPES[env_id])
-    refined = float(args.log_radius.split()[-2].split(":")[0])
+    refined = args.log_radius.places[-2]
     for progress, scale in (
         (0.0, first),
         (refined / 2, first**0.5),

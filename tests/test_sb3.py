@@ -193,7 +193,7 @@ def test_the_benchmarks_dispersed_run(tmp_path, monkeypatch):
 
     def keep_model(options, script, args, *rest):
         model = make_model(options, script, args, *rest)
-        made.append((args.mass_weight, args.dispersion, model.policy.log_std.detach().tolist()))
+        made.append((args.mass_weight.at(0.0), args.dispersion, model.policy.log_std.detach().tolist()))
         return model
 
     def keep_evaluation(env_id, policy, eval_seed, n, **options):
