@@ -136,7 +136,7 @@ class AscentSheet(Sheet):
 
     def _orbit(self, y: np.ndarray) -> np.ndarray:
         """The orbit (2, n) in m, in the target's plane, on which a state y (r, v, ...) would coast; cut far out."""
-        h, e = (np.array(vector) for vector in orbit_vectors(y, self.rocket.mu))
+        h, e = np.array(orbit_vectors(y, self.rocket.mu))
         size = np.linalg.norm(e)
         along = e / size if size > 1e-9 else y[:3] / np.linalg.norm(y[:3])
         across = np.cross(h / max(np.linalg.norm(h), 1e-300), along)  # a launch from a pole begins with h = 0
@@ -252,16 +252,13 @@ def pitch_above_horizon(flight: Flight) -> np.ndarray:
 HASTE = 1.5  # time goes with this power of the share played, since the stagings come early
 
 
-def ascent_animation(rocket: Rocket, arrays: dict, title: str) -> Animation:
-    """The flight of an evaluation, policy beside optimum."""
+def ascent_animation(rocket: Rocket, arrays: dict, title: str, vehicle: Vehicles | None = None) -> Animation:
+    """The flight of an evaluation, policy beside the nominal flight's optimum.
+
+    With a drawn `vehicle` it is the vehicle's flight, which was saved and which a failure made burn longest.
+    """
+    shown = SIDES if vehicle is None else {"_saved": "saved", "_reference": "optimum"}
     sides = []
-    for suffix, name in SIDES.items():
+    for suffix, name in shown.items():
         sides.append([Flight.of(*(arrays[f"{key}{suffix}"] for key in ("t", "u", "y")), name)])
-    return Animation.of(AscentSheet(rocket, title, compared=True), sides, HASTE)
-
-
-def failure_animation(rocket: Rocket, vehicle: Vehicles, arrays: dict, title: str) -> Animation:
-    """The saved flight of an evaluation that a failure made burn longest, beside the nominal flight's optimum."""
-    policy = Flight.of(*(arrays[f"{key}_saved"] for key in ("t", "u", "y")), "saved")
-    optimum = Flight.of(*(arrays[f"{key}_reference"] for key in ("t", "u", "y")), "optimum")
-    return Animation.of(AscentSheet(rocket, title, compared=True, vehicle=vehicle), [[policy], [optimum]], HASTE)
+    return Animation.of(AscentSheet(rocket, title, compared=True, vehicle=vehicle), sides, HASTE)

@@ -25,23 +25,21 @@ from common.files import write_json, write_npz
 from common.flying import decision_us
 from common.policies import evaluate_by_script
 from rocket import guidance
-from rocket.dispersion import draw_vehicles
-from rocket.failure import check_failure
+from rocket.failure import WHEN, check_failure
 from rocket.kalman import Filtered
-from rocket.losses import loss_lines, loss_report
+from rocket.losses import aligned, loss_lines, loss_report
 from rocket.metrics import (
     AT_ONCE,
     SUCCESS,
     chosen,
     dispersed_metrics,
-    draws,
     evaluate_dispersed,
     failure_metrics,
-    final_elements,
     healthy,
 )
 from rocket.missions import ROCKETS
 from rocket.navigation import checked_noise, noise_metrics
+from rocket.orbits import final_elements
 from rocket.rescue import Failing, Known, directions_at, failing_optima, known_optima
 from rocket.vehicle import Rocket
 
@@ -167,7 +165,7 @@ class Comparison:
 
     def draws(self, n: int) -> np.ndarray:
         """The first n draws of the seed."""
-        return draws(self.rocket, self.dispersion, self.eval_seed, n, self.failing.failure)
+        return self.failing.draws(self.rocket, self.eval_seed, n)
 
     def fly(self, name: str, opponent, n: int):
         """Fly an opponent on the first n draws, and time its decisions unless it solves.
@@ -218,12 +216,12 @@ class Comparison:
 
     def vehicles(self, z: np.ndarray):
         """The vehicles of draws z (n, k)."""
-        return draw_vehicles(self.rocket, self.dispersion, z, self.failing.failure, self.failing.failure_time)
+        return self.failing.vehicles(self.rocket, z)
 
     def metrics(self, name: str, n: int) -> dict:
         """The metrics of a competitor's first n flights, or of all its flights if it flew fewer."""
         arrays = {key: value[:n] for key, value in self.arrays[name].items()}
-        flights = recorded_flights(chosen(arrays, healthy(arrays)), self.rocket, self.dispersion)
+        flights = recorded_flights(chosen(arrays, healthy(arrays)), self.rocket, Failing(self.dispersion))
         starts = len(flights["error_norm"])
         metrics = {"dispersed_starts": starts} | dispersed_metrics(flights, self.rocket)
         if self.failures:
@@ -315,19 +313,15 @@ class Comparison:
         return report
 
 
-def recorded_flights(arrays: dict, rocket: Rocket, dispersion: float, **failing) -> dict:
-    """The flights (n,) of eval.npz's arrays, in the form that `dispersed_metrics` reads.
-
-    Flights with failures need `failure` and `failure_time` of their evaluation.
-    """
+def recorded_flights(arrays: dict, rocket: Rocket, failing: Failing) -> dict:
+    """The flights (n,) of eval.npz's arrays, in the form that `dispersed_metrics` reads."""
     y = arrays["final_y"]
-    burn_out = draw_vehicles(rocket, dispersion, arrays["draw"], **failing).burn_out
-    flights = final_elements(y, rocket) | {"final_mass_kg": y[:, 6]}
-    flights |= {
+    return final_elements(y, rocket) | {
+        "final_mass_kg": y[:, 6],
         "error_norm": np.linalg.norm(arrays["final_error"], axis=1),
-        "dry": arrays["final_t"] >= burn_out - 1e-6,
+        "dry": arrays["final_t"] >= failing.vehicles(rocket, arrays["draw"]).burn_out - 1e-6,
+        "crashed": np.linalg.norm(y[:, :3], axis=1) < rocket.Re,
     }
-    return flights | {"crashed": np.linalg.norm(y[:, :3], axis=1) < rocket.Re}
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -337,7 +331,6 @@ def recorded_flights(arrays: dict, rocket: Rocket, dispersion: float, **failing)
 COLUMNS = ("flights", "||error|| median", "p95", "max", "perigee off (km)", "in the box (95 %)", "mass (kg)")
 COLUMNS += ("of the optimum", "orbit reached", "a decision", "knows")
 WIDTHS = (7, 16, 8, 8, 16, 24, 9, 14, 14, 10, 0)
-WHEN = {"random": "from a random moment of a burn on", "ignition": "from the last stage's ignition on"}
 
 
 def table(report: dict) -> str:
@@ -354,8 +347,7 @@ def table(report: dict) -> str:
     width = max(len(row[0]) for row in rows)
     draws = f"the draws of eval seed {report['eval_seed']}, the same for all"
     lines = [f"{report['env_id']} at dispersion {report['dispersion']:g},{noise_words(report)}{about} {draws}"]
-    for name, *others in rows:
-        lines.append(f"  {name:<{width}}" + "".join(f"  {cell:>{w}}" for cell, w in zip(others, WIDTHS)))
+    lines += [aligned(f"{name:<{width}}", others, WIDTHS) for name, *others in rows]
     lines.append("  Shares: mean mass over that of the optimum that knows the draw, to the target and to the orbit")
     flights = f"of {known} flights; of fewer (in brackets) where one missed the orbit."
     lines.append(f"    that was reached, {flights}")
@@ -392,9 +384,8 @@ def failure_lines(report: dict) -> list[str]:
     for name, entry in report["laws"].items():
         rows.append([name, *(format(entry[key], form) if key in entry else "-" for key, (_, form) in columns.items())])
     width = max(len(row[0]) for row in rows)
-    for name, *others in rows:
-        cells = (f"  {cell:>{max(len(head), 8)}}" for cell, head in zip(others, rows[0][1:]))
-        lines.append(f"  {name:<{width}}" + "".join(cells))
+    widths = [max(len(head), 8) for head, _ in columns.values()]
+    lines += [aligned(f"{name:<{width}}", others, widths) for name, *others in rows]
     return lines + loss_lines(report["by_loss"])
 
 

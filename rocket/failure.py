@@ -15,7 +15,8 @@ import numpy as np
 from common.errors import is_finite, refuse_unless
 from rocket.vehicle import Rocket, engine_groups
 
-FAILURE_TIMES = ("random", "ignition")
+WHEN = {"random": "from a random moment of a burn on", "ignition": "from the last stage's ignition on"}
+FAILURE_TIMES = tuple(WHEN)
 LARGEST_FAILURE = 0.3  # share of thrust
 FAILURE_PROBABILITY = 0.5
 # uniform numbers from 0 to 1; a flight fails if the first is below `FAILURE_PROBABILITY`

@@ -12,9 +12,9 @@ from scipy.stats import binomtest
 
 from drawing.style import BOUNDARY, OPTIMUM, POLICY, TARGET
 from rocket.losses import STANDARD
-from rocket.metrics import BOX, altitude_km, element_misses, final_elements
+from rocket.metrics import BOX, altitude_km, element_misses
 from rocket.missions import Mission
-from rocket.orbits import local_frame, orbit_vectors, target_axes, target_orbit
+from rocket.orbits import final_elements, local_frame, orbit_vectors, target_axes, target_orbit
 from rocket.vehicle import Rocket
 
 DASHED = {"linewidth": 1.4, "linestyle": (0, (6, 5))}  # the gaps show the other line beneath
@@ -88,16 +88,6 @@ def pitch_and_yaw(u: np.ndarray, y: np.ndarray, rocket: Rocket) -> tuple[np.ndar
     return np.degrees(np.arcsin(np.clip(up, -1, 1))), yaw
 
 
-def target_points(rocket: Rocket) -> np.ndarray:
-    """Points (n, 3) in km, ECI, of the target orbit."""
-    return orbit_points(*target_orbit(rocket.target, rocket.mu), rocket)
-
-
-def reached_points(y: np.ndarray, rocket: Rocket) -> np.ndarray:
-    """Points (n, 3) in km, ECI, of the orbit that a flight y (K+1, 7) ended in."""
-    return orbit_points(*(np.array(vector) for vector in orbit_vectors(y[-1], rocket.mu)), rocket)
-
-
 def orbit_points(h: np.ndarray, e: np.ndarray, rocket: Rocket) -> np.ndarray:
     """Points (n, 3) in km, ECI, of the orbit with this angular momentum and eccentricity vector, (3,) each.
 
@@ -120,17 +110,19 @@ def orbit_figure(mission: Mission, arrays: dict, title: str, highest_km: float) 
     """
     figure = Figure(figsize=(13, 11), layout="constrained")
     panels = figure.subplot_mosaic([["plane", "insertion"], ["ground", "ground"]], height_ratios=[3, 2])
-    reached = reached_points(arrays["y"], mission.rocket)
+    rocket = mission.rocket
+    target = orbit_points(*target_orbit(rocket.target, rocket.mu), rocket)
+    reached = orbit_points(*np.array(orbit_vectors(arrays["y"][-1], rocket.mu)), rocket)
     lines = {
-        "target orbit": (target_points(mission.rocket), {**TARGET, "linewidth": 4.0, "alpha": 0.4}),
+        "target orbit": (target, {**TARGET, "linewidth": 4.0, "alpha": 0.4}),
         "policy": (arrays["y"][:, :3] / 1e3, OURS),
         "orbit reached": (reached, {**OURS, "linewidth": 1.0, "linestyle": ":"}),
         "optimum": (arrays["y_reference"][:, :3] / 1e3, BEST),
     }
-    plot_target_plane(panels["plane"], panels["insertion"], lines, mission.rocket)
+    plot_target_plane(panels["plane"], panels["insertion"], lines, rocket)
     top = 1.15 * max(mission.ceiling_km or 0.0, highest_km)
     panels["insertion"].set(ylim=(-0.03 * top, top))
-    plot_ground_track(panels["ground"], arrays, mission.rocket)
+    plot_ground_track(panels["ground"], arrays, rocket)
     for ax in figure.axes:
         ax.grid(alpha=0.3)
     figure.suptitle(title)
