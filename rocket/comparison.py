@@ -10,9 +10,6 @@ Reading order: policies, all on the same draws, table, command.
 
 from __future__ import annotations
 
-import json
-import os
-import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
 from pathlib import Path
@@ -23,7 +20,7 @@ from common.checkpoints import read_checkpoint
 from common.errors import refuse_unless
 from common.files import write_json, write_npz
 from common.flying import decision_us
-from common.policies import evaluate_by_script
+from common.policies import competitors, fly_by_script
 from rocket import guidance
 from rocket.failure import WHEN, check_failure
 from rocket.kalman import Filtered
@@ -84,17 +81,12 @@ def fly_checkpoint(path, dispersion: float, eval_seed: int, n: int, **options):
     Raises BadInput with the script's own line if the script refuses the policy.
     """
     args = read_checkpoint(path, {}, flag="")["args"]
-    with tempfile.TemporaryDirectory() as folder:
-        files = [Path(folder) / name for name in ("eval.json", "eval.npz")]
-        flags = {"dispersion": dispersion, "eval-starts": n, "eval-seed": eval_seed}
-        flags |= {name.replace("_", "-"): flag_words(value) for name, value in options.items()}
-        flags |= {"eval-json": files[0], "eval-npz": files[1], "num-threads": 1}
-        evaluate_by_script(POLICY_SCRIPT, path, flags)
-        decision_us = json.loads(files[0].read_text())["decision_us"]
-        with np.load(files[1]) as file:
-            names = ("draw", "final_y", "final_t", "final_error", "failure")
-            arrays = {key: file[key] for key in names if key in file}
-    return arrays, {"knows": knowledge(args), "decision_us": decision_us}
+    flags = {"dispersion": dispersion, "eval-starts": n, "eval-seed": eval_seed}
+    flags |= {name.replace("_", "-"): flag_words(value) for name, value in options.items()}
+    metrics, arrays = fly_by_script(POLICY_SCRIPT, path, flags)
+    names = ("draw", "final_y", "final_t", "final_error", "failure")
+    ends = {key: arrays[key] for key in names if key in arrays}
+    return ends, {"knows": knowledge(args), "decision_us": metrics["decision_us"]}
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -201,18 +193,12 @@ class Comparison:
         """The optima that know the draws of the first flights, to the target or to the orbits of the states `reached`.
 
         `reached` (n, 7) has the competitors one after another. They are solved in one go, because processes take
-        seconds to start. A flight with a failure has no optimum here, but None.
+        seconds to start.
         """
         z = self.draws(self.solved)
         if reached is not None:
             z = np.tile(z, (len(reached) // len(z), 1))
-        flights = np.flatnonzero(self.vehicles(z).failure[0] < 0)
-        of_reached = None if reached is None else reached[flights]
-        optima: list = [None] * len(z)
-        found = guidance.drawn_optima(self.env_id, self.dispersion, z[flights], of_reached, PROCESSES)
-        for k, optimum in zip(flights, found):
-            optima[k] = optimum
-        return optima
+        return guidance.drawn_optima(self.env_id, self.dispersion, z, reached, PROCESSES)
 
     def vehicles(self, z: np.ndarray):
         """The vehicles of draws z (n, k)."""
@@ -431,16 +417,6 @@ def duration(microseconds: float | None) -> str:
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def check(env_id: str, folder: Path, n: int, solved: int, checkpoints: dict):
-    """Raise BadInput before anything is flown, if the flags do not fit a results folder of this id."""
-    refuse_unless(ROCKETS[env_id].cutoff, f"the env_id of {folder}", env_id, "must be a rocket's with cut-off")
-    refuse_unless(solved <= n, "--solved", solved, f"must be at most {n}, as --starts is")
-    for path in checkpoints.values():
-        other = read_checkpoint(path, {}, flag="")["args"]["env_id"]
-        refuse_unless(other == env_id, f"the env_id of {path}", other, f"must be {env_id}, as that of {folder}")
-    refuse_unless(os.access(folder, os.W_OK), "the folder", folder, "must be writable")
-
-
 def compare(
     env_id: str,
     folder: Path,
@@ -462,12 +438,9 @@ def compare(
     """
     check_failure(failure, failure_time, ROCKETS[env_id].cutoff)
     noise = checked_noise(navigation_noise)
-    checkpoints = {"policy": folder / "agent.safetensors"}
-    for name, path in also:
-        is_new = name not in {*checkpoints, *KNOWLEDGE, *FILTERED}
-        refuse_unless(is_new, "the NAME of --also", name, "must be that of no other row")
-        checkpoints[name] = path
-    check(env_id, folder, n, solved, checkpoints)
+    refuse_unless(ROCKETS[env_id].cutoff, f"the env_id of {folder}", env_id, "must be a rocket's with cut-off")
+    refuse_unless(solved <= n, "--solved", solved, f"must be at most {n}, as --starts is")
+    checkpoints = competitors(env_id, folder, also, {*KNOWLEDGE, *FILTERED})
     failures = {"failure": failure, "failure_time": failure_time} if failure else {}
     comparison = Comparison(env_id, dispersion, eval_seed, n, solved, noise, **failures)
     comparison.fly_policies(checkpoints)

@@ -10,7 +10,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Rectangle
 from scipy.stats import binomtest
 
-from drawing.style import BOUNDARY, OPTIMUM, POLICY, TARGET
+from drawing.style import BOUNDARY, OPTIMUM, POLICY, TARGET, TARGET_ORBIT
 from rocket.losses import STANDARD
 from rocket.metrics import BOX, altitude_km, element_misses
 from rocket.missions import Mission
@@ -114,7 +114,7 @@ def orbit_figure(mission: Mission, arrays: dict, title: str, highest_km: float) 
     target = orbit_points(*target_orbit(rocket.target, rocket.mu), rocket)
     reached = orbit_points(*np.array(orbit_vectors(arrays["y"][-1], rocket.mu)), rocket)
     lines = {
-        "target orbit": (target, {**TARGET, "linewidth": 4.0, "alpha": 0.4}),
+        "target orbit": (target, TARGET_ORBIT),
         "policy": (arrays["y"][:, :3] / 1e3, OURS),
         "orbit reached": (reached, {**OURS, "linewidth": 1.0, "linestyle": ":"}),
         "optimum": (arrays["y_reference"][:, :3] / 1e3, BEST),

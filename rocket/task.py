@@ -217,11 +217,15 @@ class RocketTask:
         return f"{self.env_id}: ||error|| {metrics['error_norm']:.6f}, {mass}{crash}"
 
     def figures(self, arrays: dict, metrics: dict, curves: list[dict]) -> dict:
+        from drawing.training import Miss, training_figure
         from rocket.figures import ascent_figure, dispersed_figure, orbit_figure
 
-        title, figures = self.headline(metrics), {}
+        title = self.headline(metrics)
+        figures = {}
         if curves:
-            figures["training.png"] = self.training_figure(metrics, curves)
+            label = "$\\Vert$error$\\Vert$ of the mean action"
+            miss = Miss("eval/error_norm", label, success=SUCCESS, by_mean_action=True)
+            figures["training.png"] = training_figure(curves, title, metrics["reference_episodic_return"], miss)
         highest = max(metrics["max_altitude_km"], metrics["reference_max_altitude_km"])
         figures["trajectory.png"] = ascent_figure(self.mission, arrays, title)
         figures["orbit.png"] = orbit_figure(self.mission, arrays, title, highest)
@@ -230,14 +234,6 @@ class RocketTask:
             title = f"{self.env_id} at dispersion {metrics['dispersion']:g}: {inside}"
             figures["dispersed.png"] = dispersed_figure(self.mission.rocket, flights_shown(arrays), title)
         return figures
-
-    def training_figure(self, metrics: dict, curves: list[dict]):
-        """The training curves, with ||error|| of the mean action."""
-        from drawing.training import Miss, training_figure
-
-        label = "$\\Vert$error$\\Vert$ of the mean action"
-        miss = Miss("eval/error_norm", label, success=SUCCESS, by_mean_action=True)
-        return training_figure(curves, self.headline(metrics), metrics["reference_episodic_return"], miss)
 
     def animation(self, arrays: dict, metrics: dict):
         from rocket.animation import ascent_animation
