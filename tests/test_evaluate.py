@@ -19,7 +19,7 @@ from common import files
 from common.curves import cell, evaluated, read_csv, read_curve, write_csv
 from common.files import write_json, write_npz
 from drawing import animation
-from phased.metrics import cost_parts, hits_every_circle, near_origin_metrics, ratio_metrics
+from phased.metrics import cost_parts, near_origin_metrics, ratio_metrics
 
 IN_THE_PLANE = [env_id for env_id, problem in envs.PROBLEMS.items() if problem.weighted and problem.states == 2]
 SINGLE, WAYPOINTS = "DoubleIntegrator-v0", "DoubleIntegratorWaypoints-v0"
@@ -163,14 +163,6 @@ def test_metrics_of_a_single_phase_equal_plain_loops():
     assert cost_parts(envs.PROBLEMS[SINGLE], arrays["x"], arrays["u"]) == pytest.approx(np.c_[state, control, terminal])
 
 
-@pytest.mark.parametrize("env_id", IN_THE_PLANE)
-def test_cost_parts_equal_the_environments(env_id):
-    flight = envs.fly(env_id, feedback(env_id, 5.0, effort=2.0), baselines.starts(1, 6))
-    parts = np.c_[flight["cost_state"], flight["cost_control"], flight["cost_terminal"]]
-    assert cost_parts(envs.PROBLEMS[env_id], flight["x"], flight["u"]) == pytest.approx(parts, rel=1e-12)
-    assert np.array_equal(hits_every_circle(envs.PROBLEMS[env_id], flight["x"]), flight["hit"].all(axis=1))
-
-
 def test_ten_start_statistic_is_the_papers():
     rng = np.random.default_rng(0)
     cost, optimum = rng.uniform(2, 3, (2, 40))
@@ -261,12 +253,11 @@ def test_arrays_hold_the_flight_and_not_the_next_episode():
     shapes = {"t": (T + 1,), "x": (n, T + 1, 2), "u": (n, T), "reward": (n, T), "cost": (n,)}
     shapes |= {"x_reference": (n, T + 1, 2), "u_reference": (n, T), "cost_reference": (n,)}
     assert {key: value.shape for key, value in arrays.items()} == shapes
-    assert arrays["t"] == pytest.approx(np.linspace(0, 5, T + 1))
     x, u = arrays["x"], arrays["u"]
     assert np.array_equal(x[:, 0], np.random.default_rng(4).uniform(-1, 1, (n, 2)))
     assert np.abs(u).max() == 4.0 < np.abs(30 * x[:, 0, 0] + 9 * x[:, 0, 1]).max()
-    for x0, x1, v in zip(x[:, -2], x[:, -1], u[:, -1]):  # the exact discretisation leads to the last state
-        assert x1 == pytest.approx([x0[0] + 0.1 * x0[1] + 0.005 * v, x0[1] + 0.1 * v], abs=1e-12)
+    last = np.column_stack([x[:, -2, 0] + 0.1 * x[:, -2, 1] + 0.005 * u[:, -1], x[:, -2, 1] + 0.1 * u[:, -1]])
+    np.testing.assert_allclose(x[:, -1], last, atol=1e-12)  # by the exact discretisation
 
 
 def test_reference_of_other_starts_is_refused():
@@ -307,16 +298,8 @@ def test_table_shows_optimum_ours_and_ratio():
         optimum, ours = metrics[f"reference_{part}_mean"], metrics[f"{part}_mean"]
         assert line.split()[-3:] == [f"{optimum:.4f}", f"{ours:.4f}", f"{ours / optimum:.4f}"]
     text = "\n".join(lines)
-    for key in RATIOS | TEN_STARTS:
+    for key in RATIOS | TEN_STARTS | NEAR:
         assert f"{metrics[key]:.4f}" in text, key
-    assert "eval seed 5" in text
-    (first,) = (k for k, line in enumerate(lines) if "Cost ratio" in line)
-    assert lines[first + 1].split()[:2] == ["mean", f"{metrics['ratio_mean']:.4f}:"]
-    low, high = (metrics[f"ten_start_ratio_mean_p{p}"] for p in ("05", "95"))
-    assert low < high and f"{low:.4f} to {high:.4f}" in lines[first + 2]
-    assert "near the origin" in lines[first + 3]
-    (line,) = (line for line in lines if f"p95 {metrics['ratio_p95']:.4f}" in line)
-    assert line.endswith(f"of the origin {metrics['loss_near_origin_mean']:.4f}")
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), np.float64("nan")])
@@ -391,16 +374,13 @@ def test_curve_of_a_resumed_run_keeps_the_last_value(tmp_path):
 def test_figures_show_policy_optimum_targets_and_bounds():
     reference = reference_flight(WAYPOINTS, 3, 12)
     metrics, arrays = evaluate.evaluate(WAYPOINTS, feedback(WAYPOINTS, 1e3, effort=2.0), 3, 12, reference)
-    figure = figure_of("trajectories.png", arrays, metrics)
-    plane, position, velocity, control = figure.axes
+    plane, position, velocity, control = figure_of("trajectories.png", arrays, metrics).axes
     assert [(patch.center, patch.radius) for patch in plane.patches] == [((0.0, 0.0), 0.02), ((0.5, 0.5), 0.02)]
-    red = [line.get_ydata() for line in position.lines if line.get_color() == "tab:red"]
-    blue = [line.get_ydata() for line in position.lines if line.get_color() == "tab:blue"]
-    assert np.array_equal(red, arrays["x"][:10, :, 0]) and np.array_equal(blue, arrays["x_reference"][:10, :, 0])
+    for colour, suffix in (("tab:red", ""), ("tab:blue", "_reference")):
+        drawn = [line.get_ydata() for line in position.lines if line.get_color() == colour]
+        assert np.array_equal(drawn, arrays[f"x{suffix}"][:10, :, 0])
     assert any(np.array_equal(line.get_xdata(), [5.0, 5.0]) for line in control.lines), "the end of phase 1"
     assert {line.get_ydata()[0] for line in control.lines if line.get_linestyle() == "--"} == {-3.0, 3.0}
-    assert all(ax.get_xlabel() and ax.get_ylabel() for ax in figure.axes)
-    assert f"{metrics['ratio_of_sums']:.4f}" in figure.get_suptitle() and WAYPOINTS in figure.get_suptitle()
 
 
 # ---------------------------------------------------------------------------------------------------------------------

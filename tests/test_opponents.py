@@ -157,30 +157,6 @@ def test_replanning_the_nominal_flight_loses_nothing():
     assert flown["final_mass_kg"][0] == pytest.approx(rocket_reference(CUTOFF)["reference_mass_kg"], abs=0.1)
 
 
-def test_replanning_meets_what_the_replay_misses(monkeypatch):
-    """A flight with less thrust and more drag; the plans are for the vehicle that the law believes in."""
-    monkeypatch.setattr(guidance, "REPLAN_EVERY", 100.0)
-    z = np.zeros((1, SCORES))
-    z[0, [2, 5, SCORES - 3]] = -2.0, -2.0, 2.0
-    seen, solve = [], guidance.optimise_remaining
-
-    def spy(rocket, rest, guess, intervals):
-        seen.append((rest.begin, rest.thrust[0], rest.flow[0], rest.air))
-        return solve(rocket, rest, guess, intervals)
-
-    monkeypatch.setattr(guidance, "optimise_remaining", spy)
-    assert (
-        ends(guidance.Replanning(CUTOFF), z)["error_norm"][0]
-        < 2e-3
-        < 5e-3
-        < ends(guidance.open_loop(CUTOFF), z)["error_norm"][0]
-    )
-    assert [begin for begin, *_ in seen] == [300.0, 400.0, 500.0, 600.0, 700.0, 800.0, 900.0]
-    assert {what for _, *what in map(tuple, seen) for what in [tuple(what)]} == {
-        (110094.0, 16820 / 700, (1.0, 0.0, 0.0))
-    }
-
-
 def flying(law, z, step=0, lost=0.0):
     """Flights with the draws z (m, k) whose last stages lose a part of thrust and flow at the begin of a step.
 
