@@ -1,6 +1,5 @@
 """evaluate.py against plain loops: ratios, the interface's keys, figures, results folders, bad input."""
 
-import csv
 import errno
 import hashlib
 import json
@@ -16,7 +15,7 @@ import baselines
 import envs
 import evaluate
 from common import files
-from common.curves import cell, evaluated, read_csv, read_curve, write_csv
+from common.curves import evaluated, read_csv, read_curve, write_csv
 from common.files import write_json, write_npz
 from drawing import animation
 from phased.metrics import cost_parts, near_origin_metrics, ratio_metrics
@@ -346,14 +345,9 @@ def test_curve_of_a_resumed_run_keeps_the_last_value(tmp_path):
     assert values == pytest.approx([100 / 3, 200 / 3, 100.5, 400 / 3 + 0.5], rel=1e-6)
     path = tmp_path / "1.csv"
     write_csv(path, curve)
-    with open(path, newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert [row["global_step"] for row in rows] == ["100", "200", "300", "400"]
-    assert [row["eval/ratio_mean"] for row in rows] == ["", "", "1", "1.5"]
-    assert path.read_text().startswith("global_step,")
+    head, *rows = path.read_text().splitlines()
+    assert head == "global_step,losses/policy_loss,eval/ratio_mean" and rows[2] == "300,100.5,1"
     again = read_csv(path)
-    assert again.keys() == curve.keys()
-    assert [cell(value) for value in (np.nan, np.inf, 3.0)] == ["nan", "inf", "3"]
     for tag, (steps, values) in curve.items():
         assert np.array_equal(again[tag][0], steps)
         assert again[tag][1] == pytest.approx(values, rel=5e-6)

@@ -348,9 +348,9 @@ def test_a_policy_on_other_draws_is_refused(monkeypatch):
 
 def test_report(compared):
     folder, flown, reached = compared
-    report = json.loads((folder / "opponents.json").read_text())
+    laws = json.loads((folder / "opponents.json").read_text())["laws"]
     counts = []
-    for (name, law), masses in zip(report["laws"].items(), reached, strict=True):
+    for (name, law), masses in zip(laws.items(), reached, strict=True):
         errors = np.linalg.norm(flown.arrays[name]["final_error"], axis=1)
         assert law["dispersed_starts"] == len(errors) and law["first"]["dispersed_starts"] == 3
         assert law["dispersed_error_max"] == errors.max() and law["first"]["dispersed_error_max"] == errors[:3].max()
@@ -360,18 +360,12 @@ def test_report(compared):
         shares = (flown.arrays[name]["final_y"][:3, 6] / masses)[counted]
         assert law["share_reached_mean"] == pytest.approx(shares.mean(), rel=1e-12) and shares.max() < 1.0001
     assert counts[:4] == [1, 2, 2, 3]  # what is no success, or has no optimum, is left out: not all count alike
-    laws = report["laws"]
     assert laws["policy"]["knows"] == "draws in training, the draw itself"
     assert laws["optimum"]["share_target_mean"] == pytest.approx(1, abs=1e-4)
-    masses = [optimum["final_mass"] for optimum in flown.optima]
-    share = flown.arrays["tvlqr"]["final_y"][:3, 6] / masses
+    share = flown.arrays["tvlqr"]["final_y"][:3, 6] / [optimum["final_mass"] for optimum in flown.optima]
     assert laws["tvlqr"]["share_target_mean"] == pytest.approx(share.mean())
     for name in comparison.REPLANS:
         assert laws[name]["solves"] == 9 and laws[name]["decision_us"] > 1000 > laws["replay"]["decision_us"] > 0
-    lines = comparison.table(report).splitlines()
-    assert len(lines) == 2 + 10 + 5 + 2 + 4 and "replan_hint: 9 solves" in lines[-1]
-    (line,) = [line for line in lines if line.startswith("  tvlqr  ")]
-    assert f"{laws['tvlqr']['dispersed_error_median']:.6f}" in line and f"{share.mean():.3%}" in line
     assert (folder / "figures" / "opponents.png").stat().st_size > 10_000
 
 
