@@ -32,7 +32,7 @@ HEALTHY = {
     "rocket_cutoff": ("Rocket with cut-off", "eval/error_norm", "eval/error_norm", 0.0, 0.02),
 }
 SHARES = {"first tenth": (0.0, 0.1), "until half": (0.1, 0.5), "second half": (0.5, 1.0)}  # of the updates
-RANGED = ("approx_kl", "clipfrac", "entropy", "value_loss", "explained_variance", "baseline_explained_variance")
+RANGED = ("approx_kl", "clipfrac", "explained_variance")
 
 
 def curves_of(result):

@@ -1,6 +1,6 @@
-"""Write the tables of results into the pages of docs/scripts/, and that of the held-out runs into docs/results.md.
+"""Write the table of the held-out runs into docs/results.md.
 
-python docs/script_pages.py
+python docs/held_out_table.py
 """
 
 from __future__ import annotations
@@ -12,20 +12,8 @@ from pathlib import Path
 import numpy as np
 
 HERE = Path(__file__).resolve().parent
-RESULTS, PAGES = HERE.parent / "results", HERE / "scripts"
-ROWS = {  # page: result folder -> its name
-    "ppo_gtrxl_di": {"di": "Double integrator", "di_waypoints": "Two waypoints"},
-    "ppo_gtrxl_vdp": {"vdp": "Van der Pol", "vdp_waypoints": "Three waypoints"},
-    "ppo_gtrxl_rocket": {
-        "rocket_fixed": "961 s",
-        "rocket_cutoff": "Cut-off",
-        "rocket_dispersed": "Cut-off, dispersed",
-        "rocket_failures": "Cut-off, dispersed, losses of thrust",
-        "two_stage_leo": "Two stages",
-    },
-    "ppo_gtrxl_lander": {"mars_landing": "Mars landing"},
-}
-HELD_OUT = {  # result folder -> its name in docs/results.md
+RESULTS, PAGE = HERE.parent / "results", HERE / "results.md"
+HELD_OUT = {  # result folder -> its name on the page
     "di": "Double integrator",
     "vdp": "Van der Pol",
     "di_waypoints": "Double integrator, 2 waypoints",
@@ -67,31 +55,13 @@ def found_by_seeds(result):
     return {key: np.array([seed[key] for seed in seeds]) for key in seeds[0] if all(key in seed for seed in seeds)}
 
 
-def row(result, name):
-    """A result's row: the median over its seeds, and the range of all."""
-    found = found_by_seeds(result)
-    seeds = found["seed"]
-    if "ratio_of_sums" in found:
-        cells = [span(found["ratio_of_sums"], 4), span(100 * found["hit_rate"], 1) + " %"]
-    elif "landed_rate" in found:
-        cells = [span(100 * found["landed_rate"], 2) + " %", span(found["position_error_mean_m"], 2)]
-        cells += [span(found["fuel_ratio"], 3)]
-    else:
-        mass = found.get("mass_ratio_reached")
-        cells = [span(found["error_norm"], 6), "–" if mass is None else span(100 * mass, 3) + " %"]
-    updates = found["total_updates"][0]
-    minutes = np.median(found["wall_seconds"]) / 60
-    cells += [str(len(seeds)), str(updates), f"{minutes:.0f}"]
-    return f"| [{name}](../../results/{result}/README.md) | {' | '.join(cells)} |\n"
-
-
 def span(values, digits):
     """The median of some values and their range."""
     middle, low, high = (f"{value:.{digits}f}" for value in (np.median(values), min(values), max(values)))
     return middle if low == high else f"{middle} ({low} to {high})"
 
 
-def held_out_rows(result, name):
+def rows_of(result, name):
     """The rows of a result: a number's median and range over the reported seeds, and each held-out seed's."""
     reported = found_by_seeds(result)
     held_out = found_by_seeds(f"held_out/{result}")
@@ -104,22 +74,12 @@ def held_out_rows(result, name):
     return "".join(rows)
 
 
-def with_held_out_rows(text):
-    """The text of docs/results.md with the rows of its table of held-out runs."""
+def with_rows(text):
+    """The page's text with the rows of its table."""
     there = {path.parent.parent.name for path in (RESULTS / "held_out").glob("*/seeds/*.json")}
-    rows = "".join(held_out_rows(result, name) for result, name in HELD_OUT.items() if result in there)
-    return TABLE.sub(lambda found: found[1] + rows, text)
-
-
-def with_rows(text, name):
-    """A page's text with the rows of its table."""
-    rows = "".join(row(result, words) for result, words in ROWS[name].items())
+    rows = "".join(rows_of(result, name) for result, name in HELD_OUT.items() if result in there)
     return TABLE.sub(lambda found: found[1] + rows, text)
 
 
 if __name__ == "__main__":
-    page = HERE / "results.md"
-    page.write_text(with_held_out_rows(page.read_text()))
-    for name in ROWS:
-        path = PAGES / f"{name}.md"
-        path.write_text(with_rows(path.read_text(), name))
+    PAGE.write_text(with_rows(PAGE.read_text()))
