@@ -219,17 +219,6 @@ def test_a_stage_that_is_dropped_early_takes_its_propellant_along():
         assert masses[69] == pytest.approx(start - burnt - 22e3 - unburnt, abs=1e-6)
 
 
-def test_a_tank_for_several_engines_flies_nominally_and_is_not_drawn():
-    """Nine engines, of which four stop early, hold out longer than each with a tank of its own."""
-    ninth = Engine(total_mass=433e3 / 9, propellant=411e3 / 9, thrust=7.6e6 / 9, isp=306.0, burn_time=162.0)
-    burns = (Burn(120.0, ((9, ninth),)), Burn(190.0, ((5, ninth),), ((9, ninth),)), Burn(583.0, ((1, SECOND),)))
-    rocket = replace(TWO, burns=burns, end_time=583.0)
-    register_rocket("Nine-v0", rocket)
-    gym.make_vec("Nine-v0", num_envs=1)
-    with pytest.raises(BadInput, match=r"burns\[1\].end is 190.0; it cannot be drawn: .* burn until 162 s"):
-        gym.make_vec("Nine-v0", num_envs=1, dispersion=1.0)
-
-
 @pytest.mark.parametrize("first, later", [((3, 100.0, 2), 250.0), ((2, 120.0, 0), 200.0)])
 def test_engines_that_share_a_tank_never_burn_what_was_dropped(first, later):
     """Two of three cores dropped early, and two of five lit first: what burns and what leaves is what was loaded."""
