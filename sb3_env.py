@@ -10,7 +10,7 @@
     batch = gym.make_vec("RocketAscentCutoff-v0", num_envs=32, action_frame="local")
     PPO("MlpPolicy", VecNormalize(VecMonitor(NativeVecEnv(batch)), gamma=1.0)).learn(1_000_000)
 
-`benchmarks/sb3_ppo.py` measures it, and alone in the project imports it. It is for users of that library, whose
+`benchmarks.sb3_ppo` measures it, and alone in the project imports it. It is for users of that library, whose
 `make_vec_env` and `DummyVecEnv` take the single environments as they are.
 """
 

@@ -1,18 +1,16 @@
 """What the attention heads look at: the weights over the window, head by head, along one flight of a trained policy.
 
-    python benchmarks/attention.py results/rocket_dispersed results/memory/attention_rocket.png
-    python benchmarks/attention.py results/vdp_waypoints results/memory/attention_waypoints.png
+    python -m benchmarks.attention results/rocket_dispersed results/memory/attention_rocket.png
+    python -m benchmarks.attention results/vdp_waypoints results/memory/attention_waypoints.png
 
 Flies the mean action once (a rocket trained on dispersions: the first draw of `--eval-seed`, else the first start),
 draws a panel for each head, and prints how far back each looks: the mean distance under its weights, over the whole
 flight, in the 20 s after each staging (or the 1 s after each waypoint), and what uniform weights would give; and its
-largest weight on an earlier step. Then the gates: lambda's mean, the share of a block's input that passes each by, and
-what it was before training.
+largest weight on an earlier step.
 """
 
 from __future__ import annotations
 
-import importlib
 import sys
 from pathlib import Path
 
@@ -21,31 +19,10 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
-import runs  # noqa: E402
-from common.checkpoints import read_checkpoint  # noqa: E402
-from common.command_line import OneLineParser, integer  # noqa: E402
-from common.errors import refuse_unless  # noqa: E402
-from common.tasks import task_of  # noqa: E402
-from drawing.style import save_figures  # noqa: E402
-
-UNTRAINED = 1 / (1 + np.exp(-2.0))  # lambda under b_g alone
-SCRIPTS = [importlib.import_module(path.stem) for path in sorted(ROOT.glob("ppo_gtrxl_*.py"))]
-
-
-def load(checkpoint):
-    """The agent of an agent.safetensors, its script's arguments, and the options of its environments."""
-    env_id = read_checkpoint(checkpoint, {})["args"]["env_id"]
-    script = next((script for script in SCRIPTS if env_id in script.ENV_IDS), None)
-    refuse_unless(script, f"env_id of {checkpoint}", env_id, "must be one that a script trains")
-    argv = ["--eval-only", "--checkpoint", str(checkpoint)]
-    args, saved = runs.parse_args(script.Args, script.recipe, argv, script.ENV_OPTIONS, script.BUFFERS)
-    args.dispersion = saved["args"].get("dispersion", 0.0)
-    options = {name: getattr(args, name) for name in script.ENV_OPTIONS} | script.FIXED_OPTIONS
-    agent = script.Agent(args, gym.make_vec(env_id, num_envs=1, **options))
-    runs.load_checkpoint(agent, args, saved)
-    return agent, args, options
+from benchmarks.policies import load
+from common.command_line import OneLineParser, integer
+from common.tasks import task_of
+from drawing.style import save_figures
 
 
 def observations(agent, args, options, eval_seed):
@@ -85,18 +62,6 @@ def weights(agent, obs):
         scores = torch.einsum("thd,thld->htl", q, window + attention.R) / attention.dk**0.5
         found.append(scores.softmax(dim=-1))
     return torch.stack(found).numpy()
-
-
-@torch.no_grad()
-def gates(agent, obs):
-    """Mean and standard deviation of lambda (blocks, 2 gates, 2) over a flight's steps and the d components."""
-    seen = []
-    opened = [gate for block in agent.blocks for gate in (block.gate1, block.gate2)]
-    hooks = [gate.linear.register_forward_hook(lambda *passed: seen.append(passed[-1].sigmoid())) for gate in opened]
-    agent.encode(torch.as_tensor(obs, dtype=agent.actor_logstd.dtype)[None], agent.new_memory(1, noise=0.0))
-    for hook in hooks:
-        hook.remove()
-    return np.array([[lam.mean(), lam.std(correction=0)] for lam in seen]).reshape(len(agent.blocks), 2, 2)
 
 
 def attention_figure(found, t, events, title):
@@ -150,15 +115,6 @@ def heaviest(found, dt):
     return f", at most {earlier.max():.2f} on another (at {dt * step:.1f} s on that of {dt * (step - back):.1f} s)"
 
 
-def gate_lines(found):
-    """The printed table of `gates`."""
-    rows = [f"the gates' lambda, mean and standard deviation (before training about sigmoid(2) = {UNTRAINED:.2f})"]
-    for b, gate in enumerate(found, start=1):
-        first, second = (f"{mean:.2f} +- {spread:.2f}" for mean, spread in gate)
-        rows.append(f"  block {b}: past the attention {first}, past the MLP {second}")
-    return rows
-
-
 def main():
     parser = OneLineParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path, help="results/<name> or runs/...")
@@ -172,7 +128,6 @@ def main():
         obs, t, events = observations(agent, args, env_options, options.eval_seed)
         found = weights(agent, obs)
         print("\n".join(lines(found, t, events)))
-        print("\n".join(gate_lines(gates(agent, obs))))
         title = f"{args.env_id}: attention along one flight (lines: a new phase)"
         figure = attention_figure(found, t, events, title)
         save_figures(options.figure.parent, {options.figure.name: figure})

@@ -1,6 +1,6 @@
 """A policy's decision by onnxruntime and by torch: its time on one core, and the difference of the actions.
 
-    python benchmarks/decision.py results/rocket_cutoff
+    python -m benchmarks.decision results/rocket_cutoff
 
 Exports the policy and flies it once. Both decide on the same observations, and each has its own memory. torch decides
 in float32, as evaluations do, and in float64, because features that are small differences of large numbers are rounded
@@ -17,11 +17,12 @@ from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
+import torch
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-import evaluate  # noqa: E402
-from common.command_line import OneLineParser  # noqa: E402
-from common.tasks import task_of  # noqa: E402
+import evaluate
+from benchmarks.policies import load
+from common.command_line import OneLineParser
+from common.tasks import task_of
 
 
 class OnnxPolicy:
@@ -80,9 +81,6 @@ def main():
     parser = OneLineParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path, help="results/<name> or runs/...")
     folder = parser.parse_args().folder
-    import torch
-    from attention import load
-
     torch.set_num_threads(1)
     try:
         with tempfile.TemporaryDirectory() as name:
@@ -91,7 +89,7 @@ def main():
             onnx = OnnxPolicy(path)
         agent, args, options = load(folder / "agent.safetensors")
     except (OSError, ValueError) as error:
-        sys.exit(f"decision.py: {error}")
+        sys.exit(f"error: {error}")
     steps = gym.make_vec(args.env_id, num_envs=1, **options).episode_steps
     policies = {"torch": agent.make_policy(steps), "onnxruntime": onnx}
     policies["torch in float64"] = copy.deepcopy(agent).double().make_policy(steps)

@@ -1,11 +1,11 @@
 """What it costs not to know the derivative: policies trained by the gradient through the physics, beside PPO's.
 
-    python benchmarks/gradient.py di --seed 1           # the double integrator: a minute of one core
-    python benchmarks/gradient.py cutoff --seed 1       # the nominal rocket with cut-off: three minutes
-    python benchmarks/gradient.py dispersed --seed 1    # from there on, every flight another vehicle: five minutes
-    python benchmarks/gradient.py gtrxl --seed 1        # the nominal rocket by PPO's network with memory: ten minutes
-    python benchmarks/gradient.py --table               # of what is in results/peers, with our PPO beside it
-    python benchmarks/gradient.py dispersed --save runs/gradient.safetensors
+    python -m benchmarks.gradient di --seed 1           # the double integrator: a minute of one core
+    python -m benchmarks.gradient cutoff --seed 1       # the nominal rocket with cut-off: three minutes
+    python -m benchmarks.gradient dispersed --seed 1    # from there on, every flight another vehicle: five minutes
+    python -m benchmarks.gradient gtrxl --seed 1        # the nominal rocket by PPO's network with memory: ten minutes
+    python -m benchmarks.gradient --table               # of what is in results/peers, with our PPO beside it
+    python -m benchmarks.gradient dispersed --save runs/gradient.safetensors
     python evaluate.py opponents results/rocket_dispersed --also gradient=runs/gradient.safetensors
 
 PPO tries actions and learns from what they earn. With the equations of motion one can compute how the end of a flight
@@ -24,8 +24,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import shlex
-import subprocess
 import sys
 import time
 from dataclasses import asdict, dataclass
@@ -40,19 +38,19 @@ import torch
 import torch.nn.functional as F
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
-import evaluate  # noqa: E402
-import ppo_gtrxl_di  # noqa: E402
-import ppo_gtrxl_rocket  # noqa: E402
-from common.checkpoints import read_checkpoint  # noqa: E402
-from common.command_line import OneLineParser, integer, output_file  # noqa: E402
-from common.evaluations import read_json  # noqa: E402
-from common.files import write_bytes, write_json  # noqa: E402
-from common.integration import rk4  # noqa: E402
-from common.tasks import task_of  # noqa: E402
-from rocket.dynamics import ascent_dynamics  # noqa: E402
-from rocket.orbits import orbit_vectors, specific_energy, target_axes, target_orbit  # noqa: E402
+import evaluate
+import ppo_gtrxl_di
+import ppo_gtrxl_rocket
+from benchmarks.policies import ROOT, environment_options
+from benchmarks.records import cell, provenance, read_record
+from common.checkpoints import read_checkpoint
+from common.command_line import OneLineParser, integer, output_file
+from common.evaluations import read_json
+from common.files import write_bytes, write_json
+from common.integration import rk4
+from common.tasks import task_of
+from rocket.dynamics import ascent_dynamics
+from rocket.orbits import orbit_vectors, specific_energy, target_axes, target_orbit
 
 # ---------------------------------------------------------------------------------------------------------------------
 # The double integrator
@@ -480,7 +478,7 @@ ROWS = {
 def make_envs(row: Row, n: int, seed: int):
     """n environments of a row, seeded, and their options."""
     args = row.script.Args(env_id=row.env_id)
-    options = {name: getattr(args, name) for name in row.script.ENV_OPTIONS} | row.script.FIXED_OPTIONS
+    options = environment_options(row.script, args)
     if row.dispersion:
         options["dispersion"] = row.dispersion
     env = gym.make_vec(row.env_id, num_envs=n, **options).unwrapped
@@ -546,34 +544,9 @@ def policy_file(agent, args, curve: Curve, recipe: Recipe) -> bytes:
     return safetensors.torch.save(agent.float().state_dict(), {key: str(value) for key, value in metadata.items()})
 
 
-def commit() -> str | None:
-    """The short hash of the code's commit; None where there is no git."""
-    command = ["git", "-C", str(ROOT), "rev-parse", "--short", "HEAD"]
-    try:
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        return None
-
-
 # ---------------------------------------------------------------------------------------------------------------------
 # Table and command
 # ---------------------------------------------------------------------------------------------------------------------
-
-
-def cell(values: list) -> str:
-    """The median of the seeds' values and their range, to five figures, or all of a whole number."""
-    form = ".0f" if isinstance(values[0], int) else ".5g"
-    low, middle, high = (format(value, form) for value in (min(values), np.median(values), max(values)))
-    return middle if min(values) == max(values) else f"{middle} ({low} to {high})"
-
-
-def read(path: Path) -> dict:
-    """The numbers that a training wrote. Raises ValueError that names a file of another kind."""
-    try:
-        run = json.loads(path.read_text())
-        return {"flights": run["curve"][-1]["flights"], "minutes": run["curve"][-1]["minutes"], **run["final"]}
-    except (ValueError, TypeError, KeyError, IndexError) as error:
-        raise ValueError(f"{path} is not what gradient.py writes ({error!r}); delete it") from error
 
 
 def ppo_runs(row: Row) -> list[dict]:
@@ -606,7 +579,10 @@ def table(folder: Path) -> list[list[str]]:
     """Lines of cells: of each row that has runs in a folder, and of our PPO's beneath it."""
     lines, keys = [], None
     for name, row in ROWS.items():
-        runs = [read(path) for path in sorted(folder.glob(f"gradient_{name}_*.json"))]
+        runs = []
+        for path in sorted(folder.glob(f"gradient_{name}_*.json")):
+            last, final = read_record(path)
+            runs.append({"flights": last["flights"], "minutes": last["minutes"], **final})
         if not runs:
             continue
         if row.keys != keys:
@@ -615,8 +591,7 @@ def table(folder: Path) -> list[list[str]]:
         for title, knows, its_runs in ((row.title, "the physics", runs), ("  our PPO", "its flights", ppo_runs(row))):
             cells = []
             for key in ("flights", "minutes", *keys, "decision_us"):
-                values = [run[key] for run in its_runs if key in run]
-                cells.append(cell(values) if values else "-")
+                cells.append(cell([run[key] for run in its_runs if key in run]))
             lines.append([title, str(len(its_runs)), knows, *cells])
     return lines
 
@@ -641,7 +616,7 @@ def main():
     torch.set_num_threads(1)
     torch.set_default_dtype(torch.float64)
     if not options.table:
-        code = {"commit": commit(), "flags": shlex.join(sys.argv[1:])}  # now: minutes later it may be another
+        code = provenance()  # now: minutes later it may be another
         row, curve = ROWS[options.row], Curve()
         agent, args = train(options.row, options.seed, curve)
         if options.save:

@@ -1,6 +1,6 @@
 """What averaged weights are worth: a run's averaged and its last weights, flown on the same starts.
 
-    python benchmarks/last_weights.py runs/<a run> runs/<another run>
+    python -m benchmarks.last_weights runs/<a run> runs/<another run>
 
 A run averages its weights over the optimiser's steps (--weight-average), and evaluations fly this average. The run's
 training_state.pt holds the last weights, too. They are flown by the run's script, with the run's options of the
@@ -16,14 +16,12 @@ from pathlib import Path
 
 import torch
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
-import runs  # noqa: E402
-from common.command_line import OneLineParser  # noqa: E402
-from common.errors import BadInput  # noqa: E402
-from common.evaluations import read_json  # noqa: E402
-from common.policies import evaluate_by_script, script_of  # noqa: E402
-from common.tasks import task_of  # noqa: E402
+import runs
+from common.command_line import OneLineParser
+from common.errors import BadInput
+from common.evaluations import read_json
+from common.policies import evaluate_by_script, script_of
+from common.tasks import task_of
 
 NOT_OF_WEIGHTS = ("eval_seed", "eval_starts", *runs.NOT_OF_A_CHECKPOINT)  # what a file of weights does not decide
 

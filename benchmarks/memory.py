@@ -1,16 +1,10 @@
 """What the memory is for: the table and the figure of results/memory, from the evaluations of its runs.
 
-    python benchmarks/run_seeds.py benchmarks/memory_di_jobs.txt --at-once 2 --numbers      # trains what is missing
-    python benchmarks/run_seeds.py benchmarks/memory_nominal_jobs.txt --at-once 2           # the same: an hour
-    python benchmarks/run_seeds.py benchmarks/memory_rocket_jobs.txt --at-once 2            # the same: an hour
-    python benchmarks/run_seeds.py benchmarks/memory_failures_jobs.txt --at-once 2 --numbers  # the same: an hour
-    python benchmarks/run_seeds.py benchmarks/memory_navigation_jobs.txt --at-once 2 --numbers  # the same: an hour
-    python benchmarks/run_seeds.py benchmarks/memory_lander_jobs.txt --at-once 2 --numbers  # the same: hours
-    python benchmarks/run_seeds.py benchmarks/ablation_jobs.txt --at-once 2 --numbers       # the same: two hours
-    python benchmarks/memory.py                                                             # prints, draws: seconds
-    python benchmarks/memory.py --by-seed                                                   # a line for each run
+    python -m benchmarks.memory              # prints, draws: seconds
+    python -m benchmarks.memory --by-seed    # a line for each run
 
-The ablation is not about the memory. It shows what each addition to PPO brings (docs/method.md).
+results/memory/README.md has the commands that train the runs. The ablation is not about the memory. It shows what each
+addition to PPO brings (docs/method.md).
 
 Each row is one way of learning. Each number is the median over its seeds, with the range of all. Rows without a
 finished run are left out. The experiment with the hidden velocity also has the expected cost that no memory can beat.
@@ -18,7 +12,6 @@ finished run are left out. The experiment with the hidden velocity also has the 
 
 from __future__ import annotations
 
-import argparse
 import functools
 import sys
 from collections.abc import Callable
@@ -29,12 +22,14 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
-import baselines  # noqa: E402
-import envs  # noqa: E402
-from common.evaluations import read_json  # noqa: E402
-from drawing.style import save_figures  # noqa: E402
+import baselines
+import envs
+from benchmarks.records import cell
+from common.command_line import OneLineParser
+from common.evaluations import read_json
+from drawing.style import save_figures
+
+FOLDER = Path(__file__).resolve().parents[1] / "results" / "memory"
 
 
 @dataclass
@@ -208,14 +203,6 @@ def read(folder, experiment):
     return {row: [read_json(path) for path in seeds] for row, seeds in paths.items() if seeds}
 
 
-def cell(values):
-    """Median and range of the seeds' values, to five significant figures."""
-    if not values:
-        return "-"
-    low, middle, high = (f"{value:.5g}" for value in (min(values), np.median(values), max(values)))
-    return middle if len(values) == 1 else f"{middle} ({low} to {high})"
-
-
 def cell_of(runs, key):
     """The cell of a key, with the number of runs that have it if some do not. A run without hits has no ratio."""
     values = [run[key] for run in runs if key in run]
@@ -278,8 +265,8 @@ def memory_figure(results):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("folder", type=Path, nargs="?", default=ROOT / "results" / "memory")
+    parser = OneLineParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", type=Path, nargs="?", default=FOLDER)
     parser.add_argument("--by-seed", action="store_true", help="print each run, draw nothing")
     options = parser.parse_args()
     folder = options.folder
@@ -287,7 +274,7 @@ def main():
         results = {name: read(folder / name, experiment) for name, experiment in EXPERIMENTS.items()}
         results = {name: found for name, found in results.items() if found}
         if not results:
-            raise ValueError(f"{folder} has no finished run; benchmarks/memory_*_jobs.txt list them")
+            raise ValueError(f"{folder} has no finished run; benchmarks/trainings/memory_*.txt list them")
         for name, found in results.items():
             print("\n".join(table(EXPERIMENTS[name], found, options.by_seed)))
         drawn = {name: found for name, found in results.items() if EXPERIMENTS[name].drawn}

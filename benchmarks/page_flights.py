@@ -1,28 +1,26 @@
 """The differences between the flights of a page, in V8, and Python's flights in eval.npz.
 
-    python benchmarks/page_flights.py results/rocket_cutoff results/rocket_dispersed results/di
-    python benchmarks/page_flights.py --changed results/rocket_dispersed      # what other vehicles do to the three laws
+    python -m benchmarks.page_flights results/rocket_cutoff results/rocket_dispersed results/di
+    python -m benchmarks.page_flights --changed results/rocket_dispersed      # what other vehicles do to the three laws
 
 Needs `mini-racer` of requirements-extras.txt.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import re
-import sys
 from pathlib import Path
 
 import numpy as np
 from py_mini_racer import MiniRacer
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from common.checkpoints import read_checkpoint  # noqa: E402
-from common.evaluations import read_evaluation  # noqa: E402
-from common.tasks import task_of  # noqa: E402
-from evaluate import LAUNCH_LONGITUDE  # noqa: E402
-from pages.assemble import html_bytes  # noqa: E402
+from common.checkpoints import read_checkpoint
+from common.command_line import OneLineParser
+from common.evaluations import read_evaluation
+from common.tasks import task_of
+from evaluate import LAUNCH_LONGITUDE
+from pages.assemble import html_bytes
 
 NO_CHANGES = {"thrust": 0.0, "drag": 0.0, "windEast": 0.0, "windNorth": 0.0, "payload": 0.0, "failure": None}
 CHANGED = [
@@ -88,7 +86,7 @@ def print_changed(folder: Path, engine: Engine):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = OneLineParser(description=__doc__.splitlines()[0])
     parser.add_argument("folders", nargs="+", type=Path, metavar="FOLDER", help="results/<name> or runs/...")
     parser.add_argument("--changed", action="store_true", help="fly other vehicles of the paper's rocket instead")
     args = parser.parse_args()

@@ -1,6 +1,6 @@
 """Try to hurt a run from outside: kills, damaged files, absurd flags and actions, two thousand updates.
 
-    python benchmarks/robustness.py [--kills 50] [--fuzz 10000] [--soak 2000] [--seed 0]
+    python -m benchmarks.robustness [--kills 50] [--fuzz 10000] [--soak 2000] [--seed 0]
 
 Prints what was tried and how it ended. The first failure is an AssertionError. The tests do the same, but fewer times.
 """
@@ -17,6 +17,7 @@ import json
 import multiprocessing
 import os
 import pickle
+import shutil
 import signal
 import sys
 import tempfile
@@ -30,16 +31,14 @@ import gymnasium as gym
 import numpy as np
 import torch
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
-import envs  # noqa: E402
-import runs  # noqa: E402
-from common import files  # noqa: E402
-from common.checkpoints import read_checkpoint  # noqa: E402
-from common.command_line import OneLineParser, integer  # noqa: E402
-from common.tasks import env_ids  # noqa: E402
+import envs
+import runs
+from benchmarks.policies import SCRIPTS
+from common import files
+from common.checkpoints import read_checkpoint
+from common.command_line import OneLineParser, integer
+from common.tasks import env_ids
 
-SCRIPTS = [importlib.import_module(path.stem) for path in sorted(ROOT.glob("ppo_gtrxl_*.py"))]
 NETWORK = ["--embed-dim=8", "--num-heads=2", "--num-blocks=1", "--memory-length=4", "--mlp-dim=8", "--hidden-dim=8"]
 TINY = [*NETWORK, "--num-envs=2", "--num-minibatches=2", "--update-epochs=2", "--eval-starts=10", "--num-threads=1"]
 PROCESSES = multiprocessing.get_context("forkserver")  # its children have torch already: each starts at once
@@ -103,8 +102,9 @@ def kill_and_resume(kills, seed=0):
             expected = finish(Path(folder), *argv)
             seconds = time.time() - before
     for kill in range(kills):
-        with tempfile.TemporaryDirectory() as folder:
-            process = start(folder := Path(folder), *argv, slow_disk=kill % 2)
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            process = start(folder, *argv, slow_disk=kill % 2)
             began = time.time()
             written = f"runs/*/.{rng.choice(['training_state.pt', 'agent.safetensors'])}.*"
             moment = rng.uniform()
@@ -119,9 +119,11 @@ def kill_and_resume(kills, seed=0):
             saved = list(folder.glob("runs/*/training_state.pt"))
             kind = "after its end" if process.exitcode == 0 else "in a write" if kill % 2 else "at random"
             ended[kind if saved else "before the first checkpoint"] += 1
-            for run in () if saved else folder.glob("runs/*"):
-                run.rename(folder / "nothing_to_resume")
-            again = [f"--resume={saved[0].parent}"] if saved else argv
+            if saved:
+                again = [f"--resume={saved[0].parent}"]
+            else:
+                again = argv
+                shutil.rmtree(folder / "runs", ignore_errors=True)
             assert finish(folder, *again) == expected, f"kill {kill}, {kind}: other bits than uninterrupted"
     return ended
 
@@ -129,20 +131,23 @@ def kill_and_resume(kills, seed=0):
 # --- fuzzing ----------------------------------------------------------------------------------------------------------
 
 
-def outcome(call, *inputs):
-    """'works', or 'refused' if it ends with one line that begins with "error: ". Everything else is raised."""
+def outcome(case, call, *inputs):
+    """'works', or 'refused' if it ends with one line. Everything else is an AssertionError that names the case."""
     errors = io.StringIO()
     try:
         with contextlib.redirect_stderr(errors), contextlib.redirect_stdout(io.StringIO()):
             call(*inputs)
     except SystemExit as stop:
-        if not stop.code:
-            return "works"  # --help
         line = str(stop.code)
-        assert line.startswith("error: ") and "\n" not in line and not errors.getvalue(), (line, errors.getvalue())
+        is_help = not stop.code
+        is_line = line.startswith("error: ") and "\n" not in line and not errors.getvalue()
+        assert is_help or is_line, (case, line, errors.getvalue())
+        return "works" if is_help else "refused"
+    except (envs.BadInput, OSError) as error:  # the scripts print it as one line
+        assert "\n" not in str(error), (case, error)
         return "refused"
-    except (envs.BadInput, OSError):
-        return "refused"  # the scripts print it as one line
+    except BaseException as error:
+        raise AssertionError(f"{case}: {error!r}") from error
     return "works"
 
 
@@ -178,10 +183,7 @@ def fuzz_arguments(count, seed=0):
         for _ in range(count):
             script = SCRIPTS[rng.integers(len(SCRIPTS))]
             argv = random_arguments(rng, script)
-            try:
-                ended[outcome(parse_args, script, argv)] += 1
-            except BaseException as error:
-                raise AssertionError(f"{script.__name__} {argv}: {error!r}") from error
+            ended[outcome(f"{script.__name__} {argv}", parse_args, script, argv)] += 1
             assert not os.listdir()
     return ended
 
@@ -269,11 +271,8 @@ def fuzz_checkpoints(count, seed=0):
             else:
                 (run / name).write_bytes(damaged(rng, whole[name]))
             before = (run / name).read_bytes()
-            try:
-                load = (load_checkpoint, run / name) if name == names[0] else (load_state, run)
-                ended[f"{name} {outcome(load[0], script, load[1])}"] += 1
-            except BaseException as error:
-                raise AssertionError(f"case {k}, a damaged {name}: {error!r}") from error
+            load, path = (load_checkpoint, run / name) if name == names[0] else (load_state, run)
+            ended[f"{name} {outcome(f'case {k}, a damaged {name}', load, script, path)}"] += 1
             assert (run / name).read_bytes() == before and sorted(os.listdir(run)) == listing
             assert os.listdir() == ["runs"], "unpickling ran code"
     return ended
@@ -291,7 +290,7 @@ def random_actions(rng, shape):
 
 
 def fuzz_actions(count, seed=0):
-    """Actions of every kind to every environment: a finite step, or ValueError with one line."""
+    """Actions of every kind to every environment: a finite step, or BadInput with one line."""
     rng, ended = np.random.default_rng(seed), Counter()
     batches = [gym.make_vec(env_id, num_envs=5) for env_id in env_ids()]
     for batch in batches:
@@ -300,14 +299,14 @@ def fuzz_actions(count, seed=0):
         batch = batches[rng.integers(len(batches))]
         with np.errstate(over="ignore"):
             actions = random_actions(rng, batch.action_space.shape)
-        try:
-            observations, rewards, *_ = batch.step(actions)
-            assert np.isfinite(observations).all() and np.isfinite(rewards).all(), actions
-            ended["works"] += 1
-        except ValueError as error:
-            assert "\n" not in str(error), (actions, error)
-            ended["refused"] += 1
+        ended[outcome(actions, step, batch, actions)] += 1
     return ended
+
+
+def step(batch, actions):
+    """One step, whose observations and rewards must be finite."""
+    observations, rewards, *_ = batch.step(actions)
+    assert np.isfinite(observations).all() and np.isfinite(rewards).all()
 
 
 # --- soak -------------------------------------------------------------------------------------------------------------

@@ -1,8 +1,8 @@
 """Train a list of runs, some at a time, and publish them. Finished runs are skipped, and interrupted ones go on.
 
-    python benchmarks/run_seeds.py jobs.txt [--at-once 2] [--numbers]
+    python -m benchmarks.run_seeds LIST [--at-once 2] [--numbers]
 
-Each line of jobs.txt is a results folder and the command that trains for it; empty lines and # comments are skipped:
+Each line of LIST is a results folder and the command that trains for it; empty lines and # comments are skipped:
 
     results/my_di  ppo_gtrxl_di.py --seed 1 --num-threads 1
     results/my_di  ppo_gtrxl_di.py --seed 2 --num-threads 1
@@ -27,33 +27,36 @@ import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
-import evaluate  # noqa: E402
-import runs  # noqa: E402
-from common.command_line import OneLineParser, integer  # noqa: E402
-from common.evaluations import read_json  # noqa: E402
+import evaluate
+import runs
+from common.command_line import OneLineParser, integer
+from common.evaluations import read_json
 
+ROOT = Path(__file__).resolve().parents[1]
 SCRIPTS = sorted(path.name for path in ROOT.glob("ppo_gtrxl_*.py"))
 MACHINE = ("cuda", "num_threads", "resume")  # arguments that another start may change
 
 
+def start_logged(command, name):
+    """Start Python with a command. What it prints is added to runs/<name>.log."""
+    Path("runs").mkdir(exist_ok=True)
+    with open(f"runs/{name}.log", "a") as log:
+        return subprocess.Popen([sys.executable, *command], stdout=log, stderr=subprocess.STDOUT)
+
+
 @dataclass
-class Job:
+class Training:
+    """A line of a list. `work` needs its `command`, `is_trained`, `identity`, `start` and `publish`."""
+
     results: Path  # the folder to which it is published
     command: list[str]  # script and flags
     args: dict  # the script's arguments with these flags
 
-    def identity(self):
-        """The arguments that tell this job's run from others."""
-        return {name: value for name, value in self.args.items() if name not in MACHINE}
-
     def run_dir(self):
-        """The newest run in runs/ that has the arguments of this job, or None."""
+        """The newest run in runs/ that has the arguments of this training, or None."""
         mine = self.identity()
         for path in sorted(Path("runs").glob("*/args.json"), key=lambda path: path.stat().st_mtime, reverse=True):
-            others = read_args(path)
-            if mine == {name: value for name, value in others.items() if name not in MACHINE}:
+            if mine == without_machine(read_args(path)):
                 return path.parent
         return None
 
@@ -62,44 +65,49 @@ class Job:
         run = self.run_dir()
         return run is not None and all((run / name).exists() for name in ("eval.json", "eval.npz"))
 
+    def identity(self):
+        """The arguments that tell this training's run from others. Two of one identity never run at the same time."""
+        return without_machine(self.args)
+
     def start(self):
-        """Begin the job, or go on with its saved run."""
+        """Begin the training, or go on with its saved run."""
         run = self.run_dir()
         script, *flags = self.command
         if run is not None and (run / "training_state.pt").exists():
             flags = ["--resume", str(run), "--num-threads", str(self.args["num_threads"])]
-        Path("runs").mkdir(exist_ok=True)
-        with open(f"runs/{'_'.join(self.results.parts[-2:])}_seed_{self.args['seed']}.log", "a") as log:
-            return subprocess.Popen([sys.executable, ROOT / script, *flags], stdout=log, stderr=subprocess.STDOUT)
+        return start_logged([ROOT / script, *flags], f"{'_'.join(self.results.parts[-2:])}_seed_{self.args['seed']}")
 
     def publish(self, numbers):
         """Add the run, or only its numbers, to its results folder, unless all of it is there already.
 
-        The shipped policy is replaced if it is of another run of this seed. Raises OSError or ValueError that says what
-        is missing.
+        The shipped policy is replaced if it is of another run of this seed. An empty folder ships the first run. Raises
+        OSError or ValueError that says what is missing.
         """
         run = self.run_dir()
-        shipped = self.results / "eval.json"
         if run is None:
             raise ValueError("runs/ holds no run with these arguments")
+        shipped = self.results / "eval.json"
         ship = shipped.exists() and read_json(shipped)["seed"] == self.args["seed"]
-        ships = not numbers and (ship or not shipped.exists())  # an empty folder ships the first run
-        if not self.has_numbers(run) or (ships and not self.is_shipped(run)):
+        is_there = same(run / "eval.json", self.results / "seeds" / f"{self.args['seed']}.json")
+        if not numbers and (ship or not shipped.exists()):
+            files = [self.results / name for name in ("agent.safetensors", "eval.npz", "figures")]
+            is_there &= all(file.exists() for file in files) and same(run / "eval.json", shipped)
+        if not is_there:
             evaluate.publish(run, self.results, ship=ship, numbers=numbers)
 
-    def has_numbers(self, run):
-        """Whether its results folder has this run's evaluation among its seeds."""
-        return same(run / "eval.json", self.results / "seeds" / f"{self.args['seed']}.json")
 
-    def is_shipped(self, run):
-        """Whether its results folder ships this run, with policy and figures."""
-        there = all((self.results / name).exists() for name in ("agent.safetensors", "eval.npz", "figures"))
-        return there and same(run / "eval.json", self.results / "eval.json")
+def without_machine(args):
+    return {name: value for name, value in args.items() if name not in MACHINE}
 
 
 def same(path, other):
     """Whether the second file is there and has the bytes of the first."""
     return other.exists() and other.read_bytes() == path.read_bytes()
+
+
+@functools.cache
+def print_once(line):
+    print(line, flush=True)
 
 
 def read_args(path):
@@ -110,76 +118,73 @@ def read_args(path):
             raise ValueError("it holds no arguments")
         return args
     except (OSError, ValueError) as error:
-        print_once(f"{path} is skipped, a job of this run begins anew: {error}")
+        print_once(f"{path} is skipped, a training of this run begins anew: {error}")
         return {}
 
 
-@functools.cache
-def print_once(line):
-    print(line, flush=True)
-
-
-def read_jobs(path):
-    """The jobs of a file. Raises ValueError that names a line which is no job."""
-    jobs = []
+def read_trainings(path):
+    """The trainings of a list. Raises ValueError that names a line which is none."""
+    trainings = []
     for number, line in enumerate(Path(path).read_text().splitlines(), start=1):
         try:
             words = shlex.split(line, comments=True)
             if words:
-                jobs.append(read_job(words))
+                trainings.append(read_training(words))
         except (OSError, ValueError, SystemExit) as error:
             raise ValueError(f"{path}, line {number}: {str(error).removeprefix('error: ')}") from error
-    return jobs
+    return trainings
 
 
-def read_job(words):
-    """The job of a line. Raises ValueError, OSError or SystemExit that says why it is none."""
+def read_training(words):
+    """The training of a line. Raises ValueError, OSError or SystemExit that says why it is none."""
     if len(words) < 2 or words[1] not in SCRIPTS:
         raise ValueError(f"{shlex.join(words)!r} must be a results folder, one of {', '.join(SCRIPTS)} and its flags")
     results, script, *flags = words
-    kind = importlib.import_module(Path(script).stem)
     if {"--help", "-h"} & set(flags):
         raise ValueError("--help trains nothing")
+    kind = importlib.import_module(Path(script).stem)
     args, _ = runs.parse_args(kind.Args, kind.recipe, flags, kind.ENV_OPTIONS, kind.BUFFERS)
     if args.eval_only or not args.save_model:
         raise ValueError(f"{'--eval-only' if args.eval_only else '--no-save-model'} leaves no run to publish")
-    return Job(Path(results), [script, *flags], asdict(args))
+    return Training(Path(results), [script, *flags], asdict(args))
 
 
-def publish(job, numbers):
-    """Publish a job's run. Returns whether that worked. A failure prints a line, and the other jobs go on."""
+def publish(training, numbers):
+    """Publish a training's run. Returns whether that worked. A failure prints a line, and the others go on."""
     try:
-        job.publish(numbers)
+        training.publish(numbers)
     except (OSError, ValueError) as error:
-        print(f"not published: {shlex.join(job.command)}: {error}", flush=True)
+        print(f"not published: {shlex.join(training.command)}: {error}", flush=True)
         return False
     return True
 
 
 def next_free(waiting, running):
-    """The first waiting job that has other arguments than the running jobs, and so another run. None without one."""
-    busy = [job.identity() for job in running]
-    return next((job for job in waiting if job.identity() not in busy), None)
+    """The first waiting training that has another identity than the running ones. None without one."""
+    busy = [training.identity() for training in running]
+    return next((training for training in waiting if training.identity() not in busy), None)
 
 
-def work(jobs, at_once, numbers):
-    """Train the jobs, `at_once` at a time, and publish each when it ends. Returns those that failed."""
-    waiting = [job for job in jobs if not job.is_trained()]
+def work(trainings, at_once, numbers):
+    """Train a list, `at_once` at a time, and publish each when it ends. Returns those that failed."""
+    waiting = [training for training in trainings if not training.is_trained()]
     running = []
-    print(f"{len(jobs)} jobs, {len(jobs) - len(waiting)} trained already", flush=True)
-    failed = [job for job in jobs if job not in waiting and not publish(job, numbers)]
+    print(f"{len(trainings)} trainings, {len(trainings) - len(waiting)} done already", flush=True)
+    failed = [training for training in trainings if training not in waiting and not publish(training, numbers)]
     try:
         while waiting or running:
-            while len(running) < at_once and (job := next_free(waiting, [job for job, _ in running])):
-                waiting.remove(job)
-                running.append((job, job.start()))
-                print(f"started {shlex.join(job.command)}", flush=True)
+            training = next_free(waiting, [training for training, _ in running])
+            if training and len(running) < at_once:
+                waiting.remove(training)
+                running.append((training, training.start()))
+                print(f"started {shlex.join(training.command)}", flush=True)
+                continue
             time.sleep(0.2)
-            for job, process in [pair for pair in running if pair[1].poll() is not None]:
-                running.remove((job, process))
-                print(f"ended with {process.returncode}: {shlex.join(job.command)}", flush=True)
-                if process.returncode or not publish(job, numbers):
-                    failed.append(job)
+            for training, process in [pair for pair in running if pair[1].poll() is not None]:
+                running.remove((training, process))
+                print(f"ended with {process.returncode}: {shlex.join(training.command)}", flush=True)
+                if process.returncode or not publish(training, numbers):
+                    failed.append(training)
     finally:
         for _, process in running:
             process.terminate()  # saves its state
@@ -188,16 +193,21 @@ def work(jobs, at_once, numbers):
     return failed
 
 
-def main():
+def end_with_the_runs():
+    """Let Ctrl-C and SIGTERM raise, so that `work` ends what it has started."""
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell sets it to be ignored in the background
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that `work` ends the runs that it has started
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+
+
+def main():
+    end_with_the_runs()
     parser = OneLineParser(description=__doc__.splitlines()[0])
-    parser.add_argument("jobs", help="file with one run a line")
+    parser.add_argument("list", help="file with one run a line")
     parser.add_argument("--at-once", type=integer(1, 64), default=1, help="number of runs at a time")
     parser.add_argument("--numbers", action="store_true", help="publish evaluations and curves, no policies")
     options = parser.parse_args()
     try:
-        sys.exit(1 if work(read_jobs(options.jobs), options.at_once, options.numbers) else 0)
+        sys.exit(1 if work(read_trainings(options.list), options.at_once, options.numbers) else 0)
     except (OSError, ValueError) as error:
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:

@@ -1,7 +1,7 @@
 """Whether the code of every result and that of HEAD train to the same bits, by its command cut to a few updates.
 
-    python benchmarks/same_training.py                          # every result: some 20 minutes of one core
-    python benchmarks/same_training.py results/di --updates 20
+    python -m benchmarks.same_training                          # every result: some 20 minutes of one core
+    python -m benchmarks.same_training results/di --updates 20
 
 results/commits.json names the commit that trained each seed. The code of each of these commits, and that of HEAD, is
 taken out of git into a temporary folder and runs the first of the result's commands, cut to `--updates`. Schedules are
@@ -21,14 +21,11 @@ from pathlib import Path
 
 import torch
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
-import run_seeds  # noqa: E402
-
-from common.command_line import OneLineParser, integer  # noqa: E402
+from benchmarks.run_seeds import ROOT, read_trainings
+from common.command_line import OneLineParser, integer
 
 COMMITS = ROOT / "results" / "commits.json"
-JOBS = ROOT / "benchmarks" / "result_jobs.txt"
+RESULTS = ROOT / "benchmarks" / "trainings" / "results.txt"
 
 
 def checkout(commit, folder):
@@ -64,9 +61,17 @@ def differing(one, other):
     return len(one.keys() ^ other.keys()) + sum(bits(one[name]) != bits(other[name]) for name in of_both)
 
 
-def first_jobs():
-    """{results folder: its first job} of the list of results."""
-    return {str(job.results): job for job in reversed(run_seeds.read_jobs(JOBS))}
+def first_trainings():
+    """{results folder: its first training} of the list of results."""
+    first = {}
+    for training in read_trainings(RESULTS):
+        first.setdefault(str(training.results), training)
+    return first
+
+
+def results_folder(text):
+    """Argument type: a results folder, as results/commits.json names it."""
+    return text.rstrip("/")
 
 
 def compare(name, command, commits, updates, temporary):
@@ -89,12 +94,7 @@ def compare(name, command, commits, updates, temporary):
 
 def main():
     parser = OneLineParser(description=__doc__.splitlines()[0])
-    parser.add_argument(
-        "results",
-        nargs="*",
-        type=lambda name: name.rstrip("/"),
-        help="folders of results/commits.json; without one, all",
-    )
+    parser.add_argument("results", nargs="*", type=results_folder, help="without one, all of results/commits.json")
     parser.add_argument("--updates", type=integer(1, 10**6), default=6, help="updates of each training")
     options = parser.parse_args()
     commits = json.loads(COMMITS.read_text())
@@ -103,8 +103,11 @@ def main():
         sys.exit(f"error: {', '.join(unknown)} must be among {', '.join(commits)}")
     try:
         with tempfile.TemporaryDirectory() as folder:
-            names, jobs = options.results or commits, first_jobs()
-            same = [compare(name, jobs[name].command, commits[name], options.updates, Path(folder)) for name in names]
+            same = []
+            trainings = first_trainings()
+            for name in options.results or commits:
+                command = trainings[name].command
+                same.append(compare(name, command, commits[name], options.updates, Path(folder)))
     except (OSError, RuntimeError, ValueError) as error:
         sys.exit(f"error: {error}")
     sys.exit(0 if all(same) else 1)

@@ -1,9 +1,9 @@
 """Stable-Baselines3's PPO on the same environments, with the same reward and samples, evaluated by the same table.
 
     pip install -r benchmarks/requirements.txt
-    python benchmarks/sb3_ppo.py --env-id DoubleIntegrator-v0 --samples 2560000
-    python benchmarks/sb3_ppo.py --env-id RocketAscentCutoff-v0 --batch-size 512 --learning-rate 1e-3
-    python benchmarks/sb3_ppo.py --env-id RocketAscentCutoff-v0 --recurrent --dispersion 1 --start RUN.zip
+    python -m benchmarks.sb3_ppo --env-id DoubleIntegrator-v0 --samples 2560000
+    python -m benchmarks.sb3_ppo --env-id RocketAscentCutoff-v0 --batch-size 512 --learning-rate 1e-3
+    python -m benchmarks.sb3_ppo --env-id RocketAscentCutoff-v0 --recurrent --dispersion 1 --start RUN.zip
 
 It gets what our script gives its own learner: the curriculum (scale of R_terminal), the first mean action and its
 noise, the local frame, and our features of the observation, for dispersed flights with the differences from the nominal
@@ -14,11 +14,7 @@ and rewards, its discount, clipping and epochs. `peers.py` runs and lists all.
 
 from __future__ import annotations
 
-import importlib
 import json
-import shlex
-import subprocess
-import sys
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -31,17 +27,20 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnvWrapper, VecMonitor, VecNormalize
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
-import evaluate  # noqa: E402
-import runs  # noqa: E402
-from common.command_line import OneLineParser, integer  # noqa: E402
-from common.files import write_json  # noqa: E402
-from common.tasks import env_ids, task_of  # noqa: E402
-from sb3_env import NativeVecEnv  # noqa: E402
+import evaluate
+import ppo_gtrxl_di
+import ppo_gtrxl_rocket
+import ppo_gtrxl_vdp
+import runs
+from benchmarks.policies import environment_options, script_of
+from benchmarks.records import provenance
+from common.command_line import OneLineParser, integer
+from common.files import write_json
+from common.tasks import env_ids, task_of
+from sb3_env import NativeVecEnv
 
 PARTS = 20  # evaluated after each such part of the samples
-SCRIPTS = ("ppo_gtrxl_di", "ppo_gtrxl_vdp", "ppo_gtrxl_rocket")
+SCRIPTS = (ppo_gtrxl_di, ppo_gtrxl_vdp, ppo_gtrxl_rocket)  # whose problems it takes
 
 
 class OurFeatures(VecEnvWrapper):
@@ -212,20 +211,6 @@ def make_model(options, script, args, normalised, steps):
     return model
 
 
-def commit():
-    """The short hash of the code's commit; None where there is no git."""
-    command = ["git", "-C", str(ROOT), "rev-parse", "--short", "HEAD"]
-    try:
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        return None
-
-
-def script_of(env_id):
-    """Our script that trains an id, None if it is none of SCRIPTS."""
-    return next((script for script in map(importlib.import_module, SCRIPTS) if env_id in script.ENV_IDS), None)
-
-
 def flag(name):
     return f"--{name.replace('_', '-')}"
 
@@ -233,7 +218,9 @@ def flag(name):
 def parse_args():
     parser = OneLineParser(description=__doc__.splitlines()[0])
     parser.add_argument(
-        "--env-id", default="DoubleIntegrator-v0", choices=[env_id for env_id in env_ids() if script_of(env_id)]
+        "--env-id",
+        default="DoubleIntegrator-v0",
+        choices=[env_id for env_id in env_ids() if script_of(env_id) in SCRIPTS],
     )
     parser.add_argument("--samples", type=integer(1, 10**9), default=2_560_000)
     parser.add_argument("--features", default="ours", choices=["ours", "raw"])
@@ -274,14 +261,14 @@ def parse_args():
 
 def main():
     options = parse_args()
-    code = {"commit": commit(), "flags": shlex.join(sys.argv[1:])}  # now: hours later it may be another
+    code = provenance()  # now: hours later it may be another
     torch.set_num_threads(1)
     script = script_of(options.env_id)
     args = script.Args(**{**script.recipe(script.Args(env_id=options.env_id)), "env_id": options.env_id})
     args.log_std, args.flights_per_start = script.Args().log_std, 1  # the library learns its noise
     given = {name: getattr(options, name) for name in ("dispersion", "mass_weight", "log_std")}
     vars(args).update({name: value for name, value in given.items() if value is not None and hasattr(args, name)})
-    env_options = {name: getattr(args, name) for name in script.ENV_OPTIONS} | script.FIXED_OPTIONS
+    env_options = environment_options(script, args)
 
     batch = gym.make_vec(options.env_id, num_envs=options.num_envs, **env_options).unwrapped
     venv = VecMonitor(NativeVecEnv(batch))

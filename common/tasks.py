@@ -152,7 +152,7 @@ class Task(Protocol):
     # --- commands
 
     def speed_cases(self) -> list[tuple[str, dict, list | None]]:
-        """The cases of `benchmarks/env_speed.py`: label, options, and an action to hold (None: random actions)."""
+        """What `benchmarks.speed` times: label, options, and an action to hold (None: random actions)."""
         ...
 
     def add_arguments(self, parser) -> None:

@@ -5,8 +5,7 @@ import dataclasses
 import importlib
 import os
 import signal
-import sys
-from pathlib import Path
+from unittest import mock
 
 os.environ["OMP_NUM_THREADS"] = "1"  # two workers on two cores, and whatever they start
 
@@ -16,9 +15,6 @@ import pytest
 from gymnasium.spaces import Box
 
 import envs
-
-sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
-import one_update  # noqa: E402
 
 # a shell starts what it sends to the background with Ctrl-C ignored, and so would be what a test starts and interrupts
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -89,16 +85,34 @@ def new_problem(monkeypatch):
     return register
 
 
+class UpdateDone(Exception):
+    """Ends `train` after the update."""
+
+
+class OneUpdate:
+    """In place of `runs.Run`: `train` begins with update `iteration`, its losses are kept, and it ends."""
+
+    def __init__(self, iteration):
+        self.updates_done, self.losses = iteration - 1, None
+
+    def end_update(self, iteration, alive, episodes, losses, learning_rate):
+        self.losses = losses
+        raise UpdateDone
+
+
 def update(script, args, modules, envs, batch, iteration=1):
     """One update of `script.train` on this batch, in groups of `envs.flights_per_start` and without a curriculum."""
-    group = envs.flights_per_start
-    return one_update.one_update(script, args, modules, envs, batch, iteration, group)
+    given = {"rollout": lambda *inputs: (batch, None), "set_curriculum": lambda *inputs: envs.flights_per_start}
+    run = OneUpdate(iteration)
+    with contextlib.suppress(UpdateDone), mock.patch.multiple(script, **given):
+        script.train(args, *modules, envs, run)
+    return run.losses
 
 
 @pytest.fixture(scope="module")
 def robustness():
     """The benchmark as a module that its child processes can import, too."""
-    return importlib.import_module("robustness")
+    return importlib.import_module("benchmarks.robustness")
 
 
 @pytest.fixture

@@ -79,6 +79,7 @@ def test_commands_name_what_is_there(page):
     """Scripts and lists exist, and scripts that train accept the flags and their values."""
     for words in command_lines(page):
         files = [word for word in words if word.endswith((".py", ".txt"))]
+        files += [f"{word.replace('.', '/')}.py" for word in words if word.startswith("benchmarks.")]
         assert all((ROOT / word).exists() for word in files), words
         # the reader's rocket is no id here
         if not files or not files[0].startswith("ppo_gtrxl") or {"MyRocket-v0", "--help"} & set(words):

@@ -1,6 +1,6 @@
 """Damaged files, absurd flags and actions: each works or gives one line.
 
-`benchmarks/robustness.py` tries many more.
+`benchmarks.robustness` tries many more.
 """
 
 import importlib

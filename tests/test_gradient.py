@@ -1,10 +1,9 @@
-"""`benchmarks/gradient.py`: physics and derivative against the environments' flights and their differences."""
+"""`benchmarks.gradient`: physics and derivative against the environments' flights and their differences."""
 
 import sys
 from dataclasses import replace
 from pathlib import Path
 
-import gradient
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -15,6 +14,7 @@ from torch.nn.utils import parameters_to_vector, vector_to_parameters
 import envs
 import ppo_gtrxl_di
 import ppo_gtrxl_rocket
+from benchmarks import gradient
 from common.checkpoints import read_checkpoint
 from rocket.comparison import fly_checkpoint
 from rocket.metrics import evaluate_dispersed

@@ -8,11 +8,11 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
-from attention import load
 
 import baselines
 import envs
 import evaluate
+from benchmarks.policies import load
 from common.evaluations import read_evaluation
 from common.tasks import task_of
 from landing.environment import LanderVectorEnv, fly_lander

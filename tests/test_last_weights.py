@@ -1,13 +1,13 @@
-"""`benchmarks/last_weights.py`: columns that must agree and differ, the flags of a run, and what is refused."""
+"""`benchmarks.last_weights`: columns that must agree and differ, the flags of a run, and what is refused."""
 
 import importlib
 import sys
 
-import last_weights
 import pytest
 import torch
-from robustness import TINY
 
+from benchmarks import last_weights
+from benchmarks.robustness import TINY
 from common.evaluations import read_json
 
 pytestmark = pytest.mark.slow

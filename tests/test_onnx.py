@@ -14,8 +14,6 @@ EXTRAS = "needs requirements-extras.txt"
 for package in ("onnx", "onnxscript", "onnxruntime"):
     pytest.importorskip(package, reason=EXTRAS)
 
-from attention import load  # noqa: E402
-from decision import OnnxPolicy, compare  # noqa: E402
 from helpers import save  # noqa: E402
 
 import evaluate  # noqa: E402
@@ -23,6 +21,8 @@ import ppo_gtrxl_di  # noqa: E402
 import ppo_gtrxl_lander  # noqa: E402
 import ppo_gtrxl_rocket  # noqa: E402
 import ppo_gtrxl_vdp  # noqa: E402
+from benchmarks.decision import OnnxPolicy, compare  # noqa: E402
+from benchmarks.policies import load  # noqa: E402
 from common.errors import BadInput  # noqa: E402
 from common.tasks import task_of  # noqa: E402
 from formats import onnx_model  # noqa: E402

@@ -17,16 +17,16 @@ import pytest
 
 pytest.importorskip("py_mini_racer", reason="needs mini-racer, of requirements-extras.txt")
 
-import page_flights  # noqa: E402
-from attention import load  # noqa: E402
 from helpers import save  # noqa: E402
-from page_flights import NO_CHANGES, Engine  # noqa: E402
 
 import baselines  # noqa: E402
 import evaluate  # noqa: E402
 import ppo_gtrxl_di  # noqa: E402
 import ppo_gtrxl_rocket  # noqa: E402
 import ppo_gtrxl_vdp  # noqa: E402
+from benchmarks import page_flights  # noqa: E402
+from benchmarks.page_flights import NO_CHANGES, Engine  # noqa: E402
+from benchmarks.policies import load  # noqa: E402
 from common.checkpoints import read_checkpoint  # noqa: E402
 from common.errors import BadInput  # noqa: E402
 from common.evaluations import read_evaluation  # noqa: E402

@@ -1,16 +1,14 @@
-"""`benchmarks/peers.py`: its table of what is trained, and which runs are left to do."""
+"""`benchmarks.peers`: its table of what is trained, and which runs are left to do."""
 
 import json
 import re
 import subprocess
 import sys
-import time
-from pathlib import Path
 
-import peers
 import pytest
 
 import ppo_gtrxl_rocket
+from benchmarks import peers
 
 
 def trained(folder, name, seed, **final):
@@ -32,66 +30,50 @@ def test_table_of_what_is_there(tmp_path, monkeypatch):
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """An empty folder to train in: where it is and where the figures go."""
-    monkeypatch.setattr(peers, "FOLDER", tmp_path / "figures")
+    """An empty folder to train in, with two rows. The second begins with the policies of the first."""
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "runs").mkdir()
-    (tmp_path / "figures").mkdir()
+    rows = {"first": peers.Peer("", "", {}, (1, 2)), "second": peers.Peer("", "", {}, (1, 2), start="first")}
+    monkeypatch.setattr(peers, "PEERS", rows)
     return tmp_path
 
 
 @pytest.fixture
-def commands(monkeypatch):
-    """What is started instead of a training; each lasts a moment, is told apart by its --save, and ends with 0."""
-    started, failing = [], []
+def started(monkeypatch):
+    """The commands that are started. In the place of a training is a program that writes an empty record."""
+    commands = []
 
-    def run(command, **_):
-        started.append(f"begin {saved(command)}")
-        time.sleep(0.1)
-        code = int(saved(command) in failing)
-        if not code:
-            Path(saved(command)).touch()
-            Path(saved(command)).with_suffix(".pkl").touch()
-            name, seed = Path(saved(command)).stem.removeprefix("peer_").rsplit("_", 1)
-            trained(Path("figures"), name, int(seed))
-        started.append(f"end {saved(command)}")
-        return subprocess.CompletedProcess(command, code)
+    def start(command, name):
+        commands.append(command)
+        file = command[command.index("--json") + 1]
+        code = f"import time; time.sleep(0.1); open({file!r}, 'w').write({RECORD!r})"
+        return subprocess.Popen([sys.executable, "-c", code])
 
-    monkeypatch.setattr(subprocess, "run", run)
-    return started, failing
+    monkeypatch.setattr(peers, "start_logged", start)
+    return commands
 
 
-def saved(command):
-    return command[command.index("--save") + 1]
+RECORD = json.dumps({"curve": [{"samples": 1, "minutes": 1.0}], "final": {}})
 
 
-def test_a_run_that_is_there_is_not_done_again(folder, monkeypatch):
-    started = []
-    ended = subprocess.CompletedProcess([], 0)
-    monkeypatch.setattr(subprocess, "run", lambda command, **_: started.append(command) or ended)
-    trained(folder / "figures", "di", 1)
-    assert peers.train("di", 1) is None and not started
-    assert peers.train("di", 2) is None
-    assert started[0][started[0].index("--seed") + 1] == "2" and "figures/di_2.json" in started[0]
+def test_a_run_that_is_there_is_not_done_again(folder, started):
+    peers.FOLDER.mkdir(parents=True)
+    trained(peers.FOLDER, "first", 1)
+    assert peers.train_all(1, ["first"]) == []
+    (command,) = started
+    assert command[command.index("--seed") + 1] == "2" and "results/peers/first_2.json" in command
 
 
-def two_rows(monkeypatch):
-    rows = {"first": peers.Peer("", "", {}, (1, 2)), "second": peers.Peer("", "", {}, (1, 2), start="first")}
-    monkeypatch.setattr(peers, "PEERS", rows)
-
-
-def test_a_row_waits_for_the_one_that_it_begins_with(folder, commands, monkeypatch):
-    started, _ = commands
-    two_rows(monkeypatch)
-    assert peers.train_all(4) == []
-    for seed in (1, 2):
-        first, second = f"end runs/peer_first_{seed}.zip", f"begin runs/peer_second_{seed}.zip"
-        assert started.index(first) < started.index(second)
+def test_a_row_waits_for_the_one_that_it_begins_with(folder, started):
+    assert peers.train_all(4, list(peers.PEERS)) == []
+    saved = [command[command.index("--save") + 1] for command in started]
+    assert set(saved[:2]) == {"runs/peer_first_1.zip", "runs/peer_first_2.zip"}
+    begun = [command[command.index("--start") + 1] for command in started[2:]]
+    assert sorted(begun) == sorted(saved[:2])
 
 
 def test_every_command_is_one_that_the_script_takes(monkeypatch):
     pytest.importorskip("sb3_contrib")
-    import sb3_ppo
+    from benchmarks import sb3_ppo
 
     for peer in peers.PEERS.values():
         monkeypatch.setattr(sys, "argv", ["sb3_ppo.py", *peer.flags.split()])

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import run_seeds
 import safetensors
 
 import envs
+from benchmarks import run_seeds
 
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "results"
@@ -43,7 +43,7 @@ def test_a_policy_was_trained_by_the_command_that_its_list_gives(folder, monkeyp
     """All arguments, those that the recipe sets, too. The command is an id and a seed, but for the GPU's."""
     monkeypatch.chdir(ROOT)  # a command names a policy of results/
     on_gpu = folder.name == "rocket_paper"
-    jobs = run_seeds.read_jobs("benchmarks/gpu_jobs.txt" if on_gpu else "benchmarks/result_jobs.txt")
+    jobs = run_seeds.read_trainings("benchmarks/trainings/gpu.txt" if on_gpu else "benchmarks/trainings/results.txt")
     (job, *_) = [job for job in jobs if job.results.name == folder.name]
     with safetensors.safe_open(folder / "agent.safetensors", "pt") as file:
         args = json.loads(file.metadata()["args"])

@@ -1,6 +1,6 @@
 """Kills, signals, a full disk, many updates, many environments: nothing hurts a run.
 
-`benchmarks/robustness.py` does the same more often.
+`benchmarks.robustness` does the same more often.
 """
 
 import importlib

@@ -1,6 +1,7 @@
-"""`benchmarks/run_seeds.py`: skips what is finished, goes on with what was cut, publishes, reports what failed."""
+"""`benchmarks.run_seeds`: skips what is finished, goes on with what was cut, publishes, reports what failed."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -8,9 +9,9 @@ import time
 from pathlib import Path
 
 import pytest
-import run_seeds
 
 import evaluate
+from benchmarks import run_seeds
 
 pytestmark = pytest.mark.slow
 
@@ -21,8 +22,9 @@ TINY += " --num-minibatches 2 --update-epochs 2 --eval-starts 10 --recipe paper"
 
 def start(folder, lines):
     (folder / "jobs.txt").write_text("\n".join(lines))
-    command = [sys.executable, ROOT / "benchmarks" / "run_seeds.py", "jobs.txt", "--at-once", "2", "--numbers"]
-    return subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    command = [sys.executable, "-m", "benchmarks.run_seeds", "jobs.txt", "--at-once", "2", "--numbers"]
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    return subprocess.Popen(command, cwd=folder, env={**os.environ, "PYTHONPATH": str(ROOT)}, **streams)
 
 
 @pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
@@ -41,7 +43,7 @@ def test_run_seeds_survives_a_restart(tmp_path, monkeypatch, capsys, signum):
     second = start(tmp_path, lines)
     output, errors = second.communicate(timeout=120)
     assert second.returncode == 0, errors
-    assert "1 jobs, 0 trained already" in output and output.count("ended with 0") == 1
+    assert "1 trainings, 0 done already" in output and output.count("ended with 0") == 1
     (folder,) = tmp_path.glob("runs/*/")  # resumed, not begun anew
     # --numbers: neither weights nor figures
     assert [path.name for path in tmp_path.glob("results/tiny/*")] == ["seeds"]
@@ -49,14 +51,14 @@ def test_run_seeds_survives_a_restart(tmp_path, monkeypatch, capsys, signum):
     before = {path: path.stat().st_mtime_ns for path in tmp_path.glob("results/**/*")}
     monkeypatch.chdir(tmp_path)
     capsys.readouterr()
-    assert run_seeds.work(run_seeds.read_jobs("jobs.txt"), 2, numbers=True) == []
-    assert capsys.readouterr().out == "1 jobs, 1 trained already\n"
+    assert run_seeds.work(run_seeds.read_trainings("jobs.txt"), 2, numbers=True) == []
+    assert capsys.readouterr().out == "1 trainings, 1 done already\n"
     assert {path: path.stat().st_mtime_ns for path in tmp_path.glob("results/**/*")} == before
 
 
 def test_a_run_is_trained_once_its_evaluation_is_whole(tmp_path, monkeypatch):
-    monkeypatch.setattr(run_seeds.Job, "run_dir", lambda job: tmp_path)
-    job = run_seeds.Job(tmp_path, [], {})
+    monkeypatch.setattr(run_seeds.Training, "run_dir", lambda job: tmp_path)
+    job = run_seeds.Training(tmp_path, [], {})
     (tmp_path / "eval.json").touch()
     assert not job.is_trained()
     (tmp_path / "eval.npz").touch()
@@ -93,9 +95,9 @@ def test_what_is_missing_of_a_published_run_is_published(tmp_path, monkeypatch, 
     """`again` is whether with `ship`, None if not at all."""
     run, results = published_folder(tmp_path, shipped, *missing)
     published = []
-    monkeypatch.setattr(run_seeds.Job, "run_dir", lambda job: run)
+    monkeypatch.setattr(run_seeds.Training, "run_dir", lambda job: run)
     monkeypatch.setattr(evaluate, "publish", lambda *folders, **options: published.append(options["ship"]))
-    run_seeds.Job(results, [], {"seed": 1}).publish(numbers)
+    run_seeds.Training(results, [], {"seed": 1}).publish(numbers)
     assert published == ([] if again is None else [again])
 
 
@@ -139,8 +141,8 @@ def test_what_cannot_be_published_fails_alone(capsys, trained):
 
 def test_two_jobs_never_go_on_with_one_run():
     """A folder of its own does not make a job another run: it waits for the one with its arguments."""
-    here, there = (run_seeds.Job(Path("results/a"), [], {"seed": seed}) for seed in (1, 2))
-    again = run_seeds.Job(Path("results/b"), [], {"seed": 1, "num_threads": 2})
+    here, there = (run_seeds.Training(Path("results/a"), [], {"seed": seed}) for seed in (1, 2))
+    again = run_seeds.Training(Path("results/b"), [], {"seed": 1, "num_threads": 2})
     assert run_seeds.next_free([again, there], [here]) is there and run_seeds.next_free([again], [there]) is again
     assert run_seeds.next_free([again], [here, there]) is None
 
@@ -151,7 +153,7 @@ def test_a_new_run_of_the_shipped_seed_replaces_what_is_shipped(tmp_path, monkey
     for folder, shipped in ((run, seed), (results, 1)):
         folder.mkdir()
         (folder / "eval.json").write_text(json.dumps({"env_id": "VanDerPol-v0", "seed": shipped}))
-    monkeypatch.setattr(run_seeds.Job, "run_dir", lambda job: run)
+    monkeypatch.setattr(run_seeds.Training, "run_dir", lambda job: run)
     monkeypatch.setattr(evaluate, "publish", lambda *args, **options: published.append((args, options)))
-    run_seeds.Job(results, [], {"seed": seed}).publish(numbers=False)
+    run_seeds.Training(results, [], {"seed": seed}).publish(numbers=False)
     assert published == [((run, results), {"ship": replaces, "numbers": False})]

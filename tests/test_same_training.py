@@ -1,12 +1,13 @@
-"""`benchmarks/same_training.py`: code that trains otherwise is found, and every seed of the results has its commit."""
+"""`benchmarks.same_training`: code that trains otherwise is found, and every seed of the results has its commit."""
 
 import json
 import subprocess
 from pathlib import Path
 
 import pytest
-import same_training
 import torch
+
+from benchmarks import same_training
 
 pytestmark = pytest.mark.slow
 
@@ -49,7 +50,7 @@ def test_code_that_trains_otherwise_is_found(tmp_path, monkeypatch, capsys):
 
 
 def test_every_seed_of_the_results_has_its_commit():
-    jobs = same_training.first_jobs()
+    jobs = same_training.first_trainings()
     for name, commits in json.loads(same_training.COMMITS.read_text()).items():
         seeds = sorted(int(path.stem) for path in (ROOT / name / "seeds").glob("*.json"))
         assert sorted(seed for trained in commits.values() for seed in trained) == seeds, name

@@ -109,9 +109,8 @@ def test_native_batch_keeps_the_interface():
 def test_the_benchmark_shows_what_our_encoder_sees():
     """Over a flight and a crash, features of the wrapper against those of a script's own agent."""
     pytest.importorskip("sb3_contrib")
-    import sb3_ppo
-
     import ppo_gtrxl_rocket as script
+    from benchmarks import sb3_ppo
 
     env_id = "RocketAscentCutoff-v0"
     batch = gym.make_vec(env_id, num_envs=2, action_frame="local")
@@ -132,9 +131,8 @@ def test_the_benchmark_shows_what_our_encoder_sees():
 
 def test_the_benchmark_follows_our_curriculum():
     pytest.importorskip("sb3_contrib")
-    import sb3_ppo
-
     import ppo_gtrxl_rocket as script
+    from benchmarks import sb3_ppo
 
     env_id, args = "RocketAscentCutoff-v0", script.Args(env_id="RocketAscentCutoff-v0", mass_weight=3.0)
     batch = gym.make_vec(env_id, num_envs=2, action_frame="local").unwrapped
@@ -154,9 +152,8 @@ def test_the_benchmark_follows_our_curriculum():
 def test_the_benchmark_keeps_the_nominal_flight(recurrent):
     """That of the policy that the training begins with; it changes nothing at first, and is flown once."""
     sb3_contrib = pytest.importorskip("sb3_contrib")
-    import sb3_ppo
-
     import ppo_gtrxl_rocket as script
+    from benchmarks import sb3_ppo
 
     env_id, options = "RocketAscentCutoff-v0", {"action_frame": "local", "dispersion": 1.0}
     seen = sb3_ppo.OurFeatures(NativeVecEnv(gym.make_vec(env_id, num_envs=4, **options)), script, env_id)
@@ -190,7 +187,7 @@ def test_the_benchmark_keeps_the_nominal_flight(recurrent):
 def test_the_benchmarks_dispersed_run(tmp_path, monkeypatch):
     """It begins with a saved nominal run, with a price and noise of its own, and is flown on as many draws as ours."""
     pytest.importorskip("sb3_contrib")
-    import sb3_ppo
+    from benchmarks import sb3_ppo
 
     made, evaluated, make_model = [], [], sb3_ppo.make_model
 
