@@ -377,6 +377,20 @@ def test_figures_show_policy_optimum_targets_and_bounds():
     assert {line.get_ydata()[0] for line in control.lines if line.get_linestyle() == "--"} == {-3.0, 3.0}
 
 
+def test_costs_figure_shows_the_parts_and_marks_misses():
+    policy = lets_go(feedback(WAYPOINTS, 1e3, effort=1.3), np.arange(12) == 2, 90)
+    reference = reference_flight(WAYPOINTS, 3, 12, misses=np.arange(12) == 4)
+    metrics, arrays = evaluate.evaluate(WAYPOINTS, policy, 3, 12, reference)
+    panels = {ax.get_ylabel(): ax for ax in figure_of("costs.png", arrays, metrics).axes}
+    flown = envs.fly(WAYPOINTS, policy, baselines.starts(3, 12))
+    for name in ("state", "control", "terminal"):
+        heights = [bar.get_height() for bar in panels[f"{name} cost"].patches]
+        assert heights == pytest.approx([*flown[f"cost_{name}"][:10], *reference[f"cost_{name}"][:10]])
+    labels = [text.get_text() for text in panels["total cost J"].texts]
+    expected = [f"{a / b:.3f}" for a, b in zip(arrays["cost"][:10], arrays["cost_reference"][:10])]
+    assert labels == [*expected[:2], "miss", expected[3], "miss", *expected[5:]]
+
+
 # ---------------------------------------------------------------------------------------------------------------------
 # Results folders
 # ---------------------------------------------------------------------------------------------------------------------

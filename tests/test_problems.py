@@ -261,6 +261,7 @@ def test_the_command_of_the_step_before_is_shown(new_problem):
     batch = gym.make_vec(env_id, num_envs=1, observe_command=True)
     assert batch.reset(seed=0)[0][0, -1] == 0
     assert batch.step(np.array([[99.0]]))[0][0, -1] == 30.0  # as it was applied
+    assert batch.reset()[0][0, -1] == 0
 
 
 def test_velocities_can_be_hidden():
