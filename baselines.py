@@ -25,6 +25,7 @@ import sys
 import time
 from collections.abc import Callable
 from functools import lru_cache
+from pkgutil import resolve_name
 
 import numpy as np
 
@@ -32,15 +33,14 @@ from common.command_line import OneLineParser, integer, output_file
 from common.errors import BadInput, NoOptimum
 from common.files import replacing, write_npz
 from common.ipopt import limit
-from common.tasks import add_family, env_ids, task_of
+from common.tasks import env_ids, task_of
 from common.workers import Workers
-from envs import DOUBLE_INTEGRATOR, PROBLEMS, Problem, fly
+from envs import DOUBLE_INTEGRATOR
+from phased.environment import fly
 from phased.lqr import linearise, lqr, lqr_policy, riccati
-from phased.optimum import Job, best_solution, hermite_simpson, refined, shooting
-from phased.problem import flights_of_seed, starts
+from phased.optimum import StartJob, best_solution, hermite_simpson, refined, shooting
+from phased.problem import PROBLEMS, Problem, flights_of_seed, starts
 from phased.task import PhasedTask
-from rocket.optimum import rocket_reference
-from rocket.report import report_all_rockets
 
 __all__ = [  # what users import from here
     "NoOptimum", "box_qp", "linearise", "lqr", "lqr_policy", "optimise", "reference", "riccati", "rocket_reference",
@@ -93,7 +93,7 @@ def box_qp(problem: Problem, x0):
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def _solve_start(job: Job):
+def _solve_start(job: StartJob):
     """Solve one start: control (T, m), the cost, whether there is a solution, and the circles' multipliers."""
     problem = PROBLEMS[job.env_id]
     best, exists = best_solution(job)
@@ -126,7 +126,7 @@ def optimise(
     _, first, of_start = np.unique(np.hstack([x0, draw]), axis=0, return_index=True, return_inverse=True)
     order = np.argsort(first)  # in the order of the starts, so that an error names the first one
     rank = np.argsort(order)
-    jobs = [Job(env_id, defect, in_circles, int(k), x0[k], draw[k]) for k in first[order]]
+    jobs = [StartJob(env_id, defect, in_circles, int(k), x0[k], draw[k]) for k in first[order]]
     if processes is None:
         processes = max(1, min(os.cpu_count() or 1, len(jobs) // STARTS_PER_PROCESS))
     with Workers(processes) as workers:
@@ -251,6 +251,11 @@ def waypoint_reference(env_id: str, x0, processes: int | None = None, draw=None)
     return {**best, "constrained": constrained, "infeasible": ~feasible, **compared}
 
 
+def rocket_reference(env_id: str, **options) -> dict:
+    """The optimum of a rocket's id, by `rocket/optimum.py`. Small problems are solved without importing that."""
+    return resolve_name("rocket.optimum:rocket_reference")(env_id, **options)
+
+
 # ---------------------------------------------------------------------------------------------------------------------
 # What a reference is compared with
 # ---------------------------------------------------------------------------------------------------------------------
@@ -329,7 +334,7 @@ def compare_finer(env_id: str, x0, flight: dict, draw) -> dict:
     """
     problem = PROBLEMS[env_id]
     some = range(min(len(x0), FINER_STARTS))
-    jobs = [Job(env_id, shooting, problem.circles_count, k, x0[k], draw[k]) for k in some]
+    jobs = [StartJob(env_id, shooting, problem.circles_count, k, x0[k], draw[k]) for k in some]
     best = [best_solution(job)[0] for job in jobs]
     numbers = {}
     if problem.bounds:
@@ -393,7 +398,9 @@ def report(env_id: str, n: int, seed: int) -> tuple[dict, dict]:
     return numbers, {"t": problem.dt * np.arange(flight["x"].shape[1]), **arrays}
 
 
-add_family(PROBLEMS, lambda env_id: PhasedTask(env_id, PROBLEMS[env_id], kept_reference, report))
+def problem_task(env_id: str) -> PhasedTask:
+    """The task of a small problem's id, for `common.tasks.task_of`."""
+    return PhasedTask(env_id, PROBLEMS[env_id], kept_reference, report)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -427,7 +434,7 @@ def parse_args(argv=None):
         task_of(env_id).add_arguments(command)
         command.set_defaults(solve=task_of(env_id).baseline_command)
     command = commands.add_parser("rocket", help="the optima of all rockets")
-    command.set_defaults(solve=lambda args: report_all_rockets())
+    command.set_defaults(solve=lambda args: resolve_name("rocket.report:report_all_rockets")())
     for command in set(commands.choices.values()):  # a problem with two names is there twice
         command.add_argument("--json", type=output_file, metavar="F", help="write the numbers to this file")
         command.add_argument("--npz", type=output_file, metavar="F", help="write the trajectories to this file")

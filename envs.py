@@ -18,76 +18,74 @@ can import all that they need from here.
 - To add a rocket or a lander, write a file of `vehicles/` that calls `register_rocket` or `register_lander`.
 - To add a family, write a folder, and add one line `add_family` at the end of this file.
 
-Reading order: dynamics, tables, registration.
+Reading order: names for users, dynamics, tables, registration.
 """
 
 from __future__ import annotations
 
-import importlib
 import sys
 import warnings
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 
-from batched.registry import RegisteredIds
-from batched.task import BatchedTask
-from common.batch import BatchedEnv, SingleEnv
 from common.errors import BadInput
-from common.integration import rk4
+from common.registration import RegisteredIds
 from common.tasks import add_family
-from landing.environment import (
-    LanderEnv,
-    LanderVectorEnv,
-    fly_lander,
-    make_lander,
-    make_lander_vector,
-    register_lander,
-)
-from landing.lander import LANDERS, MARS, POWERED_DESCENT, Lander
-from landing.task import LanderTask
-from phased.environment import (
-    PhasedEnv,
-    PhasedVectorEnv,
-    fly,
-    make_phased,
-    make_phased_vector,
-    register_problem,
-)
-from phased.problem import PROBLEMS, Phase, Problem, uniform
-from rocket.dispersion import DISPERSION, Dispersion, draw_bounds, draw_names, draw_vehicles
-from rocket.dynamics import ascent_dynamics
-from rocket.environment import (
-    RocketEnv,
-    RocketVectorEnv,
-    flown_mission,
-    fly_rocket,
-    make_rocket,
-    make_rocket_vector,
-    register_rocket,
-)
-from rocket.missions import PAPER_MISSION, ROCKETS, Mission
-from rocket.orbits import (
-    local_frame,
-    orbit_vectors,
-    orbital_elements,
-    specific_energy,
-    target_axes,
-    target_orbit,
-    terminal_error,
-)
-from rocket.task import RocketTask
+from landing.lander import LANDERS, MARS, POWERED_DESCENT, Lander, register_lander
+from phased.problem import PROBLEMS, Phase, Problem, register_problem, uniform
+from rocket.missions import PAPER_MISSION, ROCKETS, Mission, register_rocket
 from rocket.vehicle import ROCKET, Burn, Engine, Rocket, delta_v, launch_raan
 
-__all__ = [  # what users import from here
-    "DISPERSION", "LANDERS", "MARS", "PAPER_MISSION", "POWERED_DESCENT", "PROBLEMS", "ROCKET", "ROCKETS",
-    "BadInput", "BatchedEnv", "Burn", "Dispersion", "Engine", "Lander", "LanderEnv", "LanderVectorEnv", "Mission",
-    "Phase", "PhasedEnv", "PhasedVectorEnv", "Problem", "Rocket", "RocketEnv", "RocketVectorEnv", "SingleEnv",
-    "ascent_dynamics", "delta_v", "draw_bounds", "draw_names", "draw_vehicles", "flown_mission", "fly", "fly_lander",
-    "fly_rocket", "launch_raan", "local_frame", "make_lander", "make_lander_vector", "make_phased",
-    "make_phased_vector", "make_rocket", "make_rocket_vector", "orbit_vectors", "orbital_elements", "own_ids",
-    "register_lander", "register_problem", "register_rocket", "rk4", "specific_energy", "target_axes", "target_orbit",
-    "terminal_error", "uniform",
+__all__ = [  # what users import from here; the rest of it is in `ON_DEMAND`
+    "LANDERS", "MARS", "PAPER_MISSION", "POWERED_DESCENT", "PROBLEMS", "ROCKET", "ROCKETS", "BadInput", "Burn",
+    "Engine", "Lander", "Mission", "Phase", "Problem", "Rocket", "delta_v", "launch_raan", "own_ids",
+    "register_lander", "register_problem", "register_rocket", "uniform",
 ]  # fmt: skip
+
+ON_DEMAND = {  # {name: the module that holds it}, which is imported when the name is asked for
+    "BatchedEnv": "common.batch",
+    "SingleEnv": "common.batch",
+    "rk4": "common.integration",
+    "LanderEnv": "landing.environment",
+    "LanderVectorEnv": "landing.environment",
+    "fly_lander": "landing.environment",
+    "make_lander": "landing.environment",
+    "make_lander_vector": "landing.environment",
+    "PhasedEnv": "phased.environment",
+    "PhasedVectorEnv": "phased.environment",
+    "fly": "phased.environment",
+    "make_phased": "phased.environment",
+    "make_phased_vector": "phased.environment",
+    "DISPERSION": "rocket.dispersion",
+    "Dispersion": "rocket.dispersion",
+    "draw_bounds": "rocket.dispersion",
+    "draw_names": "rocket.dispersion",
+    "draw_vehicles": "rocket.dispersion",
+    "ascent_dynamics": "rocket.dynamics",
+    "RocketEnv": "rocket.environment",
+    "RocketVectorEnv": "rocket.environment",
+    "flown_mission": "rocket.environment",
+    "fly_rocket": "rocket.environment",
+    "make_rocket": "rocket.environment",
+    "make_rocket_vector": "rocket.environment",
+    "local_frame": "rocket.orbits",
+    "orbit_vectors": "rocket.orbits",
+    "orbital_elements": "rocket.orbits",
+    "specific_energy": "rocket.orbits",
+    "target_axes": "rocket.orbits",
+    "target_orbit": "rocket.orbits",
+    "terminal_error": "rocket.orbits",
+}
+__all__ += [*ON_DEMAND]
+
+
+def __getattr__(name: str):
+    """A name of `ON_DEMAND`, as if it had been imported at the top. Python calls this for a name it does not find."""
+    if name not in ON_DEMAND:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(ON_DEMAND[name]), name)
+
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Dynamics. x is a tuple of components, each a NumPy array over environments or a CasADi symbol
@@ -177,7 +175,7 @@ def import_files_of(folder: str):
         try:
             with warnings.catch_warnings():
                 warnings.filterwarnings("error", message=OF_ANOTHER)
-                importlib.import_module(f"{folder}.{path.stem}")
+                import_module(f"{folder}.{path.stem}")
         except BadInput as error:
             print(f"{folder}/{path.name} is left out: {error}", file=sys.stderr)
         except UserWarning as error:
@@ -197,10 +195,11 @@ register_lander("MarsLanding-v0", MARS)
 register_lander("PoweredDescent-v0", POWERED_DESCENT)
 import_files_of("problems")
 import_files_of("vehicles")
-add_family(ROCKETS, RocketTask.of)
-add_family(LANDERS, LanderTask.of)
 WITHOUT_OPTIMUM = RegisteredIds(PROBLEMS, ROCKETS, LANDERS)
-add_family(WITHOUT_OPTIMUM, BatchedTask)
+add_family(PROBLEMS, "baselines:problem_task")
+add_family(ROCKETS, "rocket.task:RocketTask.of")
+add_family(LANDERS, "landing.task:LanderTask.of")
+add_family(WITHOUT_OPTIMUM, "batched.task:BatchedTask")
 
 
 def own_ids() -> list[str]:

@@ -8,8 +8,8 @@
     python evaluate.py page results/rocket_dispersed       # one HTML file in which the policy flies in a browser
     python evaluate.py export results/rocket_cutoff --onnx policy.onnx     # the policy, or its flights, for other tools
 
-A problem's family (`phased/`, `rocket/`, `landing/`) says what is measured, printed and drawn. Reading order:
-evaluation, results folders, exports, pages, command line.
+A problem's family (`phased/`, `rocket/`, `landing/`) says what is measured, printed and drawn. `exports/` writes what
+is taken away. Reading order: evaluation, results folders, command line.
 """
 
 from __future__ import annotations
@@ -17,28 +17,21 @@ from __future__ import annotations
 import subprocess
 import sys
 import tempfile
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 
-import baselines  # noqa: F401 - makes every id known to `task_of`
+import envs  # noqa: F401 - makes every id known to `task_of`
 from common.checkpoints import read_checkpoint, write_bfloat16
 from common.command_line import OneLineParser, integer, longitude, named_path, number, output_file, positive, utc
 from common.curves import evaluated, read_csv, read_curve, write_csv
 from common.errors import BadInput
-from common.evaluations import read_evaluation, read_json, read_metrics, sha256_of
+from common.evaluations import read_evaluation, read_json, read_metrics, refuse_another_policy
 from common.files import read_npz, write_bytes, write_npz
 from common.policies import script_of
 from common.tasks import task_of
-from formats.columns import csv_bytes
-from formats.czml import czml_bytes
-from formats.oem import oem_bytes
-from formats.policy import onnx_bytes
-from pages.assemble import html_bytes
-
-EPOCH = datetime(2026, 1, 1, tzinfo=UTC)  # the moment of an exported lift-off
-LAUNCH_LONGITUDE = -80.6  # degrees east, Cape Canaveral
+from drawing.evaluation import draw_animation, draw_figures
+from exports.folders import EPOCH, LAUNCH_LONGITUDE, export, page
 
 
 def evaluate(env_id: str, policy, eval_seed: int, n: int, reference: dict | None = None, **env_options):
@@ -96,12 +89,6 @@ def publish(run_dir, folder, ship: bool = False, numbers: bool = False):
             animate(staged)
             keep_excerpt(staged / "eval.npz", task_of(metrics["env_id"]))
         move(staged, folder, last, replaced=of_another_policy(folder) if ships else ())
-
-
-def refuse_another_policy(folder: Path, metrics: dict):
-    """Raise ValueError if a folder's evaluation is not of its policy."""
-    if metrics.get("checkpoint_sha256") != sha256_of(folder / "agent.safetensors"):
-        raise ValueError(f"{folder}/eval.json is not of its agent.safetensors (checkpoint_sha256 differs)")
 
 
 def shorten(run_dir) -> Path:
@@ -172,13 +159,6 @@ def redraw(folder) -> list[Path]:
     return draw_figures(folder, arrays, metrics, [own, *curves.values()] if own else [])
 
 
-def draw_figures(folder, arrays: dict, metrics: dict, curves: list[dict]) -> list[Path]:
-    """Draw the figures of an evaluation and of these training curves into folder/figures. Returns their paths."""
-    from drawing.style import save_figures  # only a drawing should wait the quarter of a second that Matplotlib takes
-
-    return save_figures(Path(folder) / "figures", task_of(metrics["env_id"]).figures(arrays, metrics, curves))
-
-
 def animate(folder) -> Path:
     """Write figures/animation.gif of a results or run folder from its eval.json and eval.npz. Returns its path.
 
@@ -187,13 +167,6 @@ def animate(folder) -> Path:
     folder = Path(folder)
     metrics, arrays = read_evaluation(folder)
     return draw_animation(folder, arrays, metrics)
-
-
-def draw_animation(folder, arrays: dict, metrics: dict) -> Path:
-    """Write the animation of an evaluation, policy beside optimum, into folder/figures. Returns its path."""
-    path = Path(folder) / "figures" / "animation.gif"
-    task_of(metrics["env_id"]).animation(arrays, metrics).write(path)
-    return path
 
 
 def seed_lines(folder) -> list[str]:
@@ -218,61 +191,6 @@ def seed_lines(folder) -> list[str]:
         cells += [format(value, form) for value in (np.median(values), min(values), max(values))]
         lines.append(f"  {label:38}" + "".join(f"{cell:>10}" for cell in cells))
     return lines
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# Exports
-# ---------------------------------------------------------------------------------------------------------------------
-
-
-def export(folder, targets: dict[str, Path], epoch: datetime = EPOCH, launch_longitude: float = LAUNCH_LONGITUDE):
-    """Write files for other tools from a results or run folder. `targets` are {format: file}:
-
-    - onnx: one step of the policy, as a model
-    - csv: its flights, a row for each step
-    - flights: its flights, a row for each
-    - oem, czml: a rocket's flight around the Earth; lift-off is at `epoch`, from `launch_longitude` (degrees east)
-
-    Raises BadInput if the folder cannot give a format, or if a package is missing. Then no file is written.
-    """
-    folder = Path(folder)
-    made = {}
-    if "onnx" in targets:
-        made["onnx"] = onnx_bytes(folder / "agent.safetensors")
-    if targets.keys() - {"onnx"}:
-        metrics, arrays = read_evaluation(folder)
-        task = task_of(metrics["env_id"])
-        if "csv" in targets:
-            made["csv"] = csv_bytes(task.step_columns(arrays, launch_longitude))
-        if "flights" in targets:
-            made["flights"] = csv_bytes(task.flight_columns(arrays, metrics))
-        if "oem" in targets:
-            made["oem"] = oem_bytes(task.track(arrays), epoch, launch_longitude)
-        if "czml" in targets:
-            made["czml"] = czml_bytes(task.track(arrays), epoch, launch_longitude)
-    for name, data in made.items():
-        write_bytes(targets[name], data)
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# Pages
-# ---------------------------------------------------------------------------------------------------------------------
-
-
-def page(folder, target=None, launch_longitude: float = LAUNCH_LONGITUDE) -> Path:
-    """Write the page of a results or run folder, in which its policy flies in a browser. Returns its path.
-
-    `target` is by default page.html in the folder. Only rockets use the longitude (degrees east). Raises OSError or
-    ValueError if a file is missing or bad, or if there is no page for such an environment or policy.
-    """
-    folder = Path(folder)
-    target = Path(target or folder / "page.html")
-    metrics, arrays = read_evaluation(folder)
-    refuse_another_policy(folder, metrics)
-    checkpoint = read_checkpoint(folder / "agent.safetensors", {"num_heads": int, "memory_length": int}, flag="")
-    found = task_of(metrics["env_id"]).page(metrics, arrays, checkpoint, launch_longitude)
-    write_bytes(target, html_bytes(found))
-    return target
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -36,6 +36,7 @@ from torch.distributions import Normal
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 import runs
+from common.flying import fly_until_ended
 from cuda_graphs import speed_up
 from envs import ROCKETS
 from rocket.policy_constants import DIFFERENCES, WIDE_DIFFERENCES, policy_constants
@@ -415,11 +416,7 @@ def fly_nominal(agent, policy, envs):
     """Fly `policy(obs, t)` in one environment and write the flight into the agent's `nominal_flight`."""
     obs, _ = envs.reset()
     flight = [obs]
-    while True:
-        obs, _, ended, _ = envs.advance(policy(obs, len(flight) - 1))
-        flight.append(obs)
-        if ended[0]:
-            break
+    fly_until_ended(envs, policy, obs, lambda step: flight.append(step.next_obs))
 
     obs = torch.as_tensor(np.concatenate(flight)).to(agent.nominal_flight)
     m = motion(agent, obs)

@@ -34,7 +34,7 @@ import torch
 import torch.distributed as dist
 import tyro
 
-import evaluate
+import envs as _envs  # noqa: F401 - makes every id known to `task_of`
 from common import files
 from common.batch import make_batch
 from common.checkpoints import COUNTERS, read_checkpoint
@@ -43,6 +43,7 @@ from common.errors import BadInput, NoOptimum
 from common.evaluations import write_evaluation
 from common.tasks import Task, task_of
 from common.tasks import env_ids as known_ids
+from drawing.evaluation import draw_animation, draw_figures
 
 gc.freeze()  # imported modules are never garbage, and looking through them takes a fifth of the time of --help
 
@@ -733,8 +734,8 @@ class Run:
             paths = (self.folder / name for name in ("agent.safetensors", "eval.json", "eval.npz"))
             write_evaluation(metrics, arrays, *paths)
         if args.capture_video:
-            evaluate.draw_figures(self.folder, arrays, metrics, [read_curve(self.folder)])
-            evaluate.draw_animation(self.folder, arrays, metrics)
+            draw_figures(self.folder, arrays, metrics, [read_curve(self.folder)])
+            draw_animation(self.folder, arrays, metrics)
         print(self.task.table(metrics))
         print(f"run folder: {self.folder}")
 

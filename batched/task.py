@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from batched import export
 from common.batch import make_batch
 from common.errors import BadInput
-from common.tasks import Interface, SampledTask
+from common.flying import fly_until_ended
+from common.tasks import SampledTask
 
 KEPT_FLIGHTS = 30  # in a results folder
 SHOWN_FLIGHTS = 10  # in a figure
@@ -37,22 +37,14 @@ class BatchedTask(SampledTask):
         seen = np.full((n, T + 1, obs.shape[1]), np.nan)
         u = np.full((n, T, envs.single_action_space.shape[0]), np.nan)
         reward = np.zeros((n, T))
-        alive, final = np.ones(n, dtype=bool), {}
         seen[:, 0] = obs
-        for t in range(T):
-            actions = np.asarray(policy(obs, t))
-            u[alive, t] = actions[alive]
-            obs, rewards, terminated, _, info = envs.step(actions)
-            reward[alive, t] = rewards[alive]
-            last = info["final_obs"] if terminated.any() else obs
-            seen[alive, t + 1] = np.where(terminated[:, None], last, obs)[alive]
-            ended = alive & terminated
-            for key, value in info.get("final_info", {}).items():
-                if not key.startswith("_"):
-                    final.setdefault(key, np.zeros_like(value))[ended] = value[ended]
-            alive &= ~terminated
-            if not alive.any():
-                break
+
+        def record(step):
+            u[step.flew, step.t] = step.action[step.flew]
+            seen[step.flew, step.t + 1] = step.next_obs[step.flew]
+            reward[step.flew, step.t] = step.reward[step.flew]
+
+        final = fly_until_ended(envs, policy, obs, record, restart=True)
         metrics = {"env_id": self.env_id, "eval_seed": eval_seed, "eval_starts": n}
         metrics["episodic_return"] = float(reward.sum(axis=1).mean())
         metrics["episodic_length"] = float(np.isfinite(u[..., 0]).sum(axis=1).mean())
@@ -112,17 +104,6 @@ class BatchedTask(SampledTask):
         """Of the first `KEPT_FLIGHTS`; all arrays but the times are by episode."""
         return {key: array if key == "t" else array[:KEPT_FLIGHTS] for key, array in arrays.items()}
 
-    # --- what is taken along
-
-    def interface(self, **env_options) -> Interface:
-        return export.interface(self.env_id, **env_options)
-
-    def step_columns(self, arrays: dict, launch_longitude: float) -> dict:
-        return export.step_columns(arrays)
-
-    def flight_columns(self, arrays: dict, metrics: dict) -> dict:
-        return export.flight_columns(arrays)
-
     # --- commands
 
     def speed_cases(self) -> list[tuple[str, dict, list | None]]:
@@ -135,6 +116,3 @@ class BatchedTask(SampledTask):
         raise BadInput(
             f"env_id is {self.env_id!r}, without an optimum; it must be a table (`envs.Problem`) or a rocket"
         )
-
-    def fly_opponents(self, folder, **options) -> None:
-        raise BadInput(f"the env_id of {folder} is {self.env_id}; it must be a rocket's with cut-off or a lander's")

@@ -21,6 +21,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.policies import load
 from common.command_line import OneLineParser, integer
+from common.flying import fly_until_ended
 from common.tasks import task_of
 from drawing.style import save_figures
 
@@ -31,14 +32,15 @@ def observations(agent, args, options, eval_seed):
     obs, _ = environment.reset(options=task_of(args.env_id).reset_options(eval_seed, 1, **options))
     policy = agent.make_policy(environment.episode_steps)
     seen = []
-    phases = []
-    ended = np.array([False])
-    while not ended.all():
-        seen.append(obs[0])
+    phases = [environment.phase[0]]
+
+    def record(step):
+        seen.append(step.obs[0])
         phases.append(environment.phase[0])
-        obs, _, ended, _ = environment.advance(policy(obs, len(seen) - 1))
+
+    fly_until_ended(environment, policy, obs, record)
     t = environment.dt * np.arange(len(seen))
-    return np.array(seen), t, t[1:][np.diff(phases) > 0]
+    return np.array(seen), t, t[1:][np.diff(phases[:-1]) > 0]
 
 
 @torch.no_grad()

@@ -22,6 +22,7 @@ import torch
 import evaluate
 from benchmarks.policies import load
 from common.command_line import OneLineParser
+from common.flying import fly_until_ended
 from common.tasks import task_of
 
 
@@ -59,20 +60,22 @@ def compare(env_id: str, policies: dict, n: int = 1, seed: int = 0, **env_option
     """
     envs = gym.make_vec(env_id, num_envs=n, **env_options)
     obs, _ = envs.reset(options=task_of(env_id).reset_options(seed, n, **env_options))
-    alive = np.ones(n, dtype=bool)
     actions = {name: [] for name in policies}
     seconds = {name: [] for name in policies}
-    for t in range(envs.episode_steps):
+    first = next(iter(policies))
+
+    def all_decide(obs, t):
         for name, policy in policies.items():
             begin = time.perf_counter()
-            action = policy(obs, t)
+            actions[name].append(policy(obs, t))
             seconds[name].append(time.perf_counter() - begin)
-            actions[name].append(np.where(alive[:, None], action, np.nan))
-        flown = np.nan_to_num(actions[next(iter(policies))][-1], nan=1.0)
-        obs, _, ended, _ = envs.advance(flown)
-        alive &= ~ended
-        if not alive.any():
-            break
+        return actions[first][-1]
+
+    def record(step):
+        for name in policies:
+            actions[name][-1] = np.where(step.flew[:, None], actions[name][-1], np.nan)
+
+    fly_until_ended(envs, all_decide, obs, record)
     microseconds = {name: 1e6 * float(np.median(values)) for name, values in seconds.items()}
     return microseconds, {name: np.array(rows) for name, rows in actions.items()}
 

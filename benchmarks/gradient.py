@@ -47,6 +47,7 @@ from common.checkpoints import read_checkpoint
 from common.command_line import OneLineParser, integer, output_file
 from common.evaluations import read_json
 from common.files import write_bytes, write_json
+from common.flying import decision_us, fly_until_ended
 from common.integration import rk4
 from common.tasks import task_of
 from rocket.dynamics import ascent_dynamics
@@ -180,7 +181,7 @@ class Physics:
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-class Flights(NamedTuple):
+class Flown(NamedTuple):
     """n flights as the environments flew them, T steps. After its end a flight repeats its last step."""
 
     y: torch.Tensor  # (T, n, 7) at the begins of the steps
@@ -190,22 +191,23 @@ class Flights(NamedTuple):
     crashed: bool  # whether any did
 
 
-def fly(agent, env) -> Flights:
+def fly(agent, env) -> Flown:
     """One flight of the mean action in each environment."""
     policy = agent.make_policy(env.episode_steps)
     obs, _ = env.reset()
-    columns, running = [], np.ones(env.num_envs, dtype=bool)
-    last, crashed = np.zeros(env.num_envs, dtype=int), False
-    while running.any():
-        t, y, shown = len(columns), env.y.T.copy(), obs[:, 6:9]
-        obs, _, ended, _ = env.advance(policy(obs, t))
-        columns.append((y, env.u.T, shown))
-        last[running] = t
-        crashed = crashed or (np.linalg.norm(env.y[:3, running], axis=0) < env.rocket.Re).any()
-        running = running & ~ended
-        env.y[:, ~running] = y.T[:, ~running]
-    y, u, shown = (torch.tensor(np.array(column)) for column in zip(*columns))
-    return Flights(y, u, shown, torch.tensor(last), bool(crashed))
+    y, u, shown = [env.y.T.copy()], [], []
+    last = np.zeros(env.num_envs, dtype=int)
+
+    def record(step):
+        y.append(env.y.T.copy())
+        u.append(env.u.T)
+        shown.append(step.obs[:, 6:9])
+        last[step.flew] = step.t
+
+    final = fly_until_ended(env, policy, obs, record)
+    repeated = np.minimum(np.arange(len(u))[:, None], last), np.arange(env.num_envs)
+    columns = (torch.tensor(np.array(column)[repeated]) for column in (y, u, shown))
+    return Flown(*columns, torch.tensor(last), bool(final["crashed"].any()))
 
 
 def directions(agent, physics: Physics, y, shown, cache, t):
@@ -224,13 +226,13 @@ def weights_of(agent) -> list:
     return [*agent.encoder.parameters(), *agent.blocks.parameters(), *agent.actor.parameters()]
 
 
-def derivative(agent, env, flights: Flights):
+def derivative(agent, env, flights: Flown):
     """`Physics.outcome` (n, 7) of flights that these environments flew, and its derivative (n, 7, W) by the weights."""
     physics = Physics(env, len(flights.y))
     return unrolled(agent, physics, flights) if agent.num_blocks else adjoint(agent, physics, flights)
 
 
-def unrolled(agent, physics: Physics, flights: Flights):
+def unrolled(agent, physics: Physics, flights: Flown):
     """`derivative` for any policy: fly once more in torch, step by step, and let autograd go back."""
     T, n = flights.y.shape[:2]
     states = [flights.y[0]]
@@ -275,7 +277,7 @@ def empty_cache(agent, n: int) -> list:
     return cache
 
 
-def adjoint(agent, physics: Physics, flights: Flights):
+def adjoint(agent, physics: Physics, flights: Flown):
     """`derivative` for a policy without memory, in a tenth of the time: the method of adjoints.
 
     Once flown, the steps of all flights can be linearised at once instead of one by one:
@@ -520,19 +522,8 @@ def evaluated(row: Row, agent) -> dict:
     policy = agent.float().make_policy(env.episode_steps)
     n = task.default_flights(is_brief=False, **options)
     metrics, _ = evaluate.evaluate(row.env_id, policy, 0, n, **options)
-    return metrics | task.reported_metrics(metrics, policy, **options) | {"decision_us": decision_us(env, policy)}
-
-
-def decision_us(env, policy) -> float:
-    """Median microseconds of one core for a decision, over a flight that is alone in its batch."""
-    obs, seconds, has_ended = env.reset()[0], [], False
-    while not has_ended:
-        begin = time.process_time()
-        action = policy(obs, len(seconds))
-        seconds.append(time.process_time() - begin)
-        obs, _, ended, _ = env.advance(action)
-        has_ended = ended[0]
-    return 1e6 * float(np.median(seconds))
+    microseconds = decision_us(row.env_id, policy, **options)
+    return metrics | task.reported_metrics(metrics, policy, **options) | {"decision_us": microseconds}
 
 
 def policy_file(agent, args, curve: Curve, recipe: Recipe) -> bytes:

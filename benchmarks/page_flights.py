@@ -19,8 +19,9 @@ from common.checkpoints import read_checkpoint
 from common.command_line import OneLineParser
 from common.evaluations import read_evaluation
 from common.tasks import task_of
-from evaluate import LAUNCH_LONGITUDE
-from pages.assemble import html_bytes
+from exports.folders import LAUNCH_LONGITUDE
+from exports.offers import offer
+from exports.page import html_bytes
 
 NO_CHANGES = {"thrust": 0.0, "drag": 0.0, "windEast": 0.0, "windNorth": 0.0, "payload": 0.0, "failure": None}
 CHANGED = [
@@ -55,7 +56,7 @@ def page_of(folder: Path) -> str:
     """The page of a results or run folder."""
     metrics, arrays = read_evaluation(folder)
     checkpoint = read_checkpoint(folder / "agent.safetensors", {})
-    return html_bytes(task_of(metrics["env_id"]).page(metrics, arrays, checkpoint, LAUNCH_LONGITUDE)).decode()
+    return html_bytes(offer(task_of(metrics["env_id"]), "page")(metrics, arrays, checkpoint, LAUNCH_LONGITUDE)).decode()
 
 
 def print_differences(folder: Path, engine: Engine):

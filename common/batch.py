@@ -148,8 +148,7 @@ class BatchedEnv(Sealed, VectorEnv):
             final_info = {**final, **{f"_{key}": terminated.copy() for key in final}}
             info = {"final_obs": obs, "_final_obs": terminated.copy()}
             info |= {"final_info": final_info, "_final_info": terminated.copy()}
-            self._restart(terminated, None)
-            obs = self._observe()
+            obs = self.restart(terminated)
         return obs, rewards, terminated, np.zeros(self.num_envs, dtype=bool), info
 
     def _step_and_wait(self, actions):
@@ -161,8 +160,7 @@ class BatchedEnv(Sealed, VectorEnv):
                 actions = np.where(begins[:, None], 1.0, actions)
         obs, rewards, terminated, final = self.advance(actions)
         if begins.any():
-            self._restart(begins, None)
-            obs = self._observe()
+            obs = self.restart(begins)
             rewards = np.where(begins, 0.0, rewards)
         terminated = terminated & ~begins
         self._waiting = terminated
@@ -194,6 +192,11 @@ class BatchedEnv(Sealed, VectorEnv):
         if self.render_mode is not None:
             self._record(np.ones(self.num_envs, dtype=bool))
         return self._observe(), rewards, terminated, final() if terminated.any() else {}
+
+    def restart(self, mask):
+        """Start the environments in `mask` (N,) anew. Returns the observations (N, obs) of all."""
+        self._restart(mask, None)
+        return self._observe()
 
     def render(self):
         """The running episodes so far, a tuple of N frames, uint8 (H, W, 3). Without a render mode a warning and None.

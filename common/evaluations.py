@@ -57,3 +57,9 @@ def read_json(path: Path) -> dict:
     if not isinstance(metrics.get("seed"), int):
         raise ValueError(f"{path}: seed is {metrics.get('seed')!r}; it must be an integer")
     return metrics
+
+
+def refuse_another_policy(folder: Path, metrics: dict):
+    """Raise ValueError if a folder's evaluation is not of its policy."""
+    if metrics.get("checkpoint_sha256") != sha256_of(folder / "agent.safetensors"):
+        raise ValueError(f"{folder}/eval.json is not of its agent.safetensors (checkpoint_sha256 differs)")

@@ -4,26 +4,18 @@ A *family* is a kind of environment. The small problems (`phased/`), the rockets
 (`landing/`) have tables. `batched/` is for all other environments derived from `BatchedEnv`. `evaluate.py`, `runs.py`,
 the command of `baselines.py` and the benchmarks call `task_of(env_id)`. They never ask which family an id is of.
 
-A new family is a folder with a class of this shape, and one line `add_family(TABLES, make_task)` in `envs.py`. The
-small problems' line is in `baselines.py`, which solves them. So their ids are known after `import baselines`, which
-`evaluate.py` does.
+A new family is a folder with a class of this shape, and one line `add_family(TABLES, "module:function")` in `envs.py`.
+So every id is known after `import envs`. A family's module is imported when the task of one of its ids is asked for.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from pkgutil import resolve_name
+from typing import Any, Protocol
 
 from common.errors import BadInput
-
-
-class Interface(NamedTuple):
-    """The numbers that a policy takes and gives, for users who call it elsewhere."""
-
-    observation: Sequence[tuple[str, str]]  # name and unit of each number, in order
-    action: Sequence[tuple[str, str]]  # the same for the action
-    notes: str  # frames, hidden observations, and the use of an action
 
 
 class Task(Protocol):
@@ -124,31 +116,6 @@ class Task(Protocol):
         """The arrays that a results folder keeps."""
         ...
 
-    # --- for other tools (`python evaluate.py export`, `page`)
-
-    def interface(self, **env_options) -> Interface:
-        """Names and units of what a policy observes and commands."""
-        ...
-
-    def step_columns(self, arrays: dict, launch_longitude: float) -> dict[str, Any]:
-        """The flights of eval.npz with a row for each step: {name: NumPy column}. Only rockets use the longitude."""
-        ...
-
-    def flight_columns(self, arrays: dict, metrics: dict) -> dict[str, Any]:
-        """The flights of eval.npz with a row for each: {name: NumPy column}. Raises BadInput if there is only one."""
-        ...
-
-    def track(self, arrays: dict) -> Any:
-        """The flight around the Earth, a `formats.track.Track`. Raises BadInput for other flights."""
-        ...
-
-    def page(self, metrics: dict, arrays: dict, checkpoint: dict, launch_longitude: float) -> Any:
-        """The flight in the browser, a `pages.assemble.Page`. Raises BadInput if this task has no page.
-
-        `checkpoint` is the answer of `read_checkpoint`. Only rockets use the longitude.
-        """
-        ...
-
     # --- commands
 
     def speed_cases(self) -> list[tuple[str, dict, list | None]]:
@@ -168,20 +135,10 @@ class Task(Protocol):
         ...
 
 
-class GroundTask:
-    """The base of tasks whose flights do not go around the Earth: it refuses `track` and `page`."""
+class SampledTask:
+    """The base of tasks in which every seed samples new flights, and all flights take the same time to evaluate."""
 
     env_id: str
-
-    def track(self, arrays: dict) -> Any:
-        raise BadInput(f"the env_id is {self.env_id}; for OEM and CZML it must be a rocket's")
-
-    def page(self, metrics: dict, arrays: dict, checkpoint: dict, launch_longitude: float) -> Any:
-        raise BadInput(f"the env_id is {self.env_id}; a page is of a rocket or of a small problem")
-
-
-class SampledTask(GroundTask):
-    """The base of tasks in which every seed samples new flights, and all flights take the same time to evaluate."""
 
     def reported_metrics(self, metrics: dict, timed_policy: Callable | None = None, **env_options) -> dict:
         return {}
@@ -198,14 +155,19 @@ class SampledTask(GroundTask):
     def remark_on_seed(self, eval_seed: int) -> str | None:
         return f"--eval-seed {eval_seed} is the training's --seed: it may have flown these starts"
 
+    def fly_opponents(self, folder: Path, **options) -> None:
+        raise BadInput(f"the env_id of {folder} is {self.env_id}; it must be a rocket's with cut-off or a lander's")
 
-# (tables by environment id, function that makes an id's task) of each family
-FAMILIES: list[tuple[Mapping[str, Any], Callable[[str], Task]]] = []
+
+# (tables by environment id, "module:function" that makes an id's task) of each family
+FAMILIES: list[tuple[Mapping[str, Any], str]] = []
 
 
-def add_family(tables: Mapping[str, Any], make_task: Callable[[str], Task]) -> None:
-    """Make a family's ids known, also those that are added to `tables` later. The same `tables` replace themselves."""
-    FAMILIES[:] = [family for family in FAMILIES if family[0] is not tables]
+def add_family(tables: Mapping[str, Any], make_task: str) -> None:
+    """Make a family's ids known, also those that are added to `tables` later.
+
+    `make_task` names the function that makes an id's task, as "module:function".
+    """
     FAMILIES.append((tables, make_task))
 
 
@@ -236,5 +198,5 @@ def task_of(env_id: str) -> Task:
     """The task of an environment id. Raises BadInput if no family has the id."""
     for tables, make_task in FAMILIES:
         if env_id in tables:
-            return make_task(env_id)
+            return resolve_name(make_task)(env_id)
     raise BadInput(f"env_id is {env_id!r}, of no family (`add_family`); it must be one of {', '.join(env_ids())}")

@@ -26,7 +26,7 @@ from common.files import write_json
 from common.policies import evaluate_by_script
 from landing.environment import fly_lander
 from landing.guidance import LAWS, Replanned, drdv, drdv_estimated
-from landing.lander import LANDERS, Lander, flights
+from landing.lander import LANDERS, Lander, draw_flights
 from landing.metrics import draws, flight_metrics, fly_draws
 from landing.optimum import references
 
@@ -101,7 +101,7 @@ def decision_us(env_id: str, make_law: Callable, z: np.ndarray, **options) -> fl
 def law_makers(lander: Lander, failure: dict) -> dict[str, Callable]:
     """{name of `LAWS`: make_law}, where make_law(z) gives the law for the flights of draws z (n, 13)."""
     return {
-        "drdv": lambda z: drdv(lander, flights(lander, z, *failure.values()).gravity.T),
+        "drdv": lambda z: drdv(lander, draw_flights(lander, z, *failure.values()).gravity.T),
         "drdv_estimated": lambda z: drdv_estimated(lander),
         "replanned": lambda z: Replanned(lander),
         "replanned_wary": lambda z: Replanned(lander, is_wary=True),

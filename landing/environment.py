@@ -1,4 +1,4 @@
-"""The landers' environment: N descents in closed form with exact touchdowns, and how an id is registered."""
+"""The landers' environment: N descents in closed form with exact touchdowns."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.envs.registration import ENV_ID_RE
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
 
 from common.batch import RENDERED, BatchedEnv, SingleEnv, check_options, of_batch, refuse_autoreset
 from common.errors import BadInput, is_finite, refuse_unless
+from common.flying import fly_until_ended
 from landing.dynamics import Arc
-from landing.lander import DRAW, LANDERS, Flights, Lander, check_failure, flights
+from landing.lander import DRAW, LANDERS, Flights, Lander, check_failure, draw_flights
 from landing.rewards import (
     ALOFT_PRICE,
     FUEL_PRICE,
@@ -145,7 +145,7 @@ class LanderVectorEnv(BatchedEnv):
 
     def _drawn(self, draw) -> Flights:
         failure = self.failure_probability, self.failure_size, self.failure_time
-        return flights(self.lander, draw, *failure, self.start_spread)
+        return draw_flights(self.lander, draw, *failure, self.start_spread)
 
     def _observation_space(self):
         """The box that holds every observation."""
@@ -384,22 +384,6 @@ def make_lander(env_id: str, **options) -> LanderEnv:
 make_lander.metadata = RENDERED  # gym.make looks here before there is an environment
 
 
-def register_lander(env_id: str, lander: Lander):
-    """Register a lander as an environment id, which `ppo_gtrxl_lander.py`, evaluations and references then take, too.
-
-    Raises BadInput if the id is taken or not in Gymnasium's form.
-    """
-    taken = env_id in gym.registry or not ENV_ID_RE.fullmatch(env_id) or "/" in env_id
-    refuse_unless(not taken, "env_id", repr(env_id), "must be a new id such as MyLander-v0")
-    gym.register(
-        id=env_id,
-        entry_point="envs:make_lander",
-        vector_entry_point="envs:make_lander_vector",
-        kwargs={"env_id": env_id},
-    )
-    LANDERS[env_id] = lander
-
-
 def fly_lander(env_id: str, policy: Callable, draw: np.ndarray, decision_s: float = PERIOD, **options) -> dict:
     """Fly `policy(obs (n, obs), t) -> action (n, 3)` on draws (n, 13), and record the flights by periods of 0.2 s.
 
@@ -415,24 +399,25 @@ def fly_lander(env_id: str, policy: Callable, draw: np.ndarray, decision_s: floa
     start = state_of(batch)
     gravity = batch.flights.gravity.T.copy()
     u, effectiveness, y = [], [], [start]
-    final_info = {}
-    alive = np.ones(len(draw), dtype=bool)
-    for period in range(batch.episode_steps):
+    command = None
+
+    def held(obs, period):
+        nonlocal command
         if period % hold == 0:
-            action = policy(obs, period // hold)
-        acts = batch.effectiveness().T
-        obs, _, ended, final = batch.advance(action)
-        u.append(np.where(alive[:, None], batch.u, np.nan))
-        effectiveness.append(np.where(alive[:, None], acts, np.nan))
-        y.append(np.where(alive[:, None], state_of(batch), np.nan))
-        for key, value in final.items():
-            final_info.setdefault(key, value.copy())[alive & ended] = value[alive & ended]
-        alive &= ~ended
-        if not alive.any():
-            break
+            command = policy(obs, period // hold)
+        effectiveness.append(batch.effectiveness().T)  # before the period, in which a failure may strike
+        return command
+
+    def record(period):
+        flew = period.flew[:, None]
+        u.append(np.where(flew, batch.u, np.nan))
+        effectiveness[-1] = np.where(flew, effectiveness[-1], np.nan)
+        y.append(np.where(flew, state_of(batch), np.nan))
+
+    final = fly_until_ended(batch, held, obs, record)
     flown = {"u": u, "effectiveness": effectiveness, "y": y}
     flown = {key: np.stack(rows, axis=1) for key, rows in flown.items()}
-    return {**flown, "start": start, "gravity": gravity, **final_info}
+    return {**flown, "start": start, "gravity": gravity, **final}
 
 
 def state_of(batch: LanderVectorEnv) -> np.ndarray:

@@ -23,7 +23,7 @@ from common.errors import NoOptimum
 from common.workers import Workers
 from landing.environment import PERIOD
 from landing.lander import Lander
-from landing.optimum import Descent, Mesh, Trajectory, energy_optimal_time, solve_from_guess, straight_line
+from landing.optimum import Descent, LandingMesh, Trajectory, energy_optimal_time, solve_from_guess, straight_line
 
 LAWS = {  # what each law has to know
     "drdv": "true gravity; nominal mass",
@@ -169,7 +169,7 @@ PLAN_INTERVALS = 25
 DURATIONS = (0.8, 1.2)  # guesses of a first plan's, in units of the energy-optimal time
 
 
-class Job(NamedTuple):
+class PlanJob(NamedTuple):
     """A plan to be solved; it holds all that a process needs."""
 
     lander: Lander
@@ -178,13 +178,13 @@ class Job(NamedTuple):
     guess: Trajectory | None  # the rest of the last plan
 
 
-def plan_one(job: Job) -> tuple[Trajectory | None, float]:
+def plan_one(job: PlanJob) -> tuple[Trajectory | None, float]:
     """The plan of one flight, or None if IPOPT finds none, and the seconds that it took on one core."""
     begin = time.process_time()
     guesses = first_guesses(job) if job.guess is None else [job.guess]
     plan = None
     for guess in guesses:
-        mesh = Mesh.stretched(PLAN_INTERVALS, guess.seconds)
+        mesh = LandingMesh.stretched(PLAN_INTERVALS, guess.seconds)
         try:
             plan = solve_from_guess(job.lander, job.descent, guess, mesh, limits=job.limits)
             break
@@ -193,7 +193,7 @@ def plan_one(job: Job) -> tuple[Trajectory | None, float]:
     return plan, time.process_time() - begin
 
 
-def first_guesses(job: Job) -> list[Trajectory]:
+def first_guesses(job: PlanJob) -> list[Trajectory]:
     """The guesses from which IPOPT begins without a last plan."""
     r = job.descent.state[None, :3]
     v = job.descent.state[None, 3:6]
@@ -280,7 +280,7 @@ class Replanned:
             self.thrust[k] = plan.thrust
             self.y[k] = plan.y
 
-    def _job(self, obs, k: int) -> Job:
+    def _job(self, obs, k: int) -> PlanJob:
         """The job of planning flight k at obs (obs,), by the estimate, with the rest of the last plan as the guess."""
         effectiveness = self.estimate.effectiveness[k]
         plan = self.plans[k]
@@ -290,11 +290,11 @@ class Replanned:
         share = WARY_RESERVE if self.is_wary and is_whole else RESERVE
         limits = PLANNED_LEAST * self.lander.least_thrust, share * self.lander.greatest_thrust
         if plan is None:
-            return Job(self.lander, descent, limits, None)
+            return PlanJob(self.lander, descent, limits, None)
         passed = obs[6] - self.ends[k, 0]
         t = np.linspace(passed, plan.seconds, PLAN_INTERVALS + 1)
         rest = Trajectory(t - passed, plan.thrust_at((t[:-1] + t[1:]) / 2), plan.state_at(t))
-        return Job(self.lander, descent, limits, rest)
+        return PlanJob(self.lander, descent, limits, rest)
 
     def _acceleration(self, r, v, now) -> np.ndarray:
         """The plans' acceleration (n, 3) over the period from `now` (n,) s on, with gravity and feedback."""

@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from common.errors import is_finite, refuse_unless, refuse_unless_finite
+from common.registration import register
 
 FAILURE_TIMES = ("start", "random")
 LAST_FAILURE = 40.0  # s, before which "random" failures strike
@@ -115,7 +116,7 @@ class Flights(NamedTuple):
 DRAW = ("x", "y", "z", "vx", "vy", "vz", "mass", "gx", "gy", "gz", "failure", "axis", "moment")
 
 
-def flights(
+def draw_flights(
     lander: Lander, draw: np.ndarray, probability: float, size: float, time: str, start_spread: float = 1.0
 ) -> Flights:
     """The flights of draws (n, 13). `start_spread` widens the box of the starts, but not its heights and sink rates.
@@ -167,4 +168,14 @@ POWERED_DESCENT = Lander(  # six engines of 3100 N, throttled between 0.3 and 0.
     start=(2000.0, 0.0, 1500.0, 100.0, 0.0, -75.0),
 )
 
-LANDERS: dict[str, Lander] = {}  # by environment id; `register_lander` of `environment.py` fills it
+LANDERS: dict[str, Lander] = {}  # by environment id; `register_lander` fills it
+
+
+def register_lander(env_id: str, lander: Lander):
+    """Register a lander as an environment id, which `ppo_gtrxl_lander.py`, evaluations and references then take, too.
+
+    Its environment (`environment.py`) is imported when one is made. Raises BadInput if the id is taken or not in
+    Gymnasium's form.
+    """
+    register(env_id, "make_lander")
+    LANDERS[env_id] = lander

@@ -18,7 +18,7 @@ from common.ipopt import SolveClock, interruptible, limit
 from common.workers import Workers
 from landing.dynamics import TINY, burn
 from landing.environment import PERIOD, LanderVectorEnv, state_of
-from landing.lander import DRAW, LANDERS, Flights, Lander, check_failure, flights
+from landing.lander import DRAW, LANDERS, Flights, Lander, check_failure, draw_flights
 
 # ---------------------------------------------------------------------------------------------------------------------
 # A flight as it is solved
@@ -85,7 +85,7 @@ SHORTEST, LONGEST = 0.02, 10.0  # s, the bounds of an interval's length
 MAX_ITERATIONS = 300  # a landing that exists takes 14 to 90
 
 
-class Mesh(NamedTuple):
+class LandingMesh(NamedTuple):
     """The intervals of a program. Some have a fixed length, the free ones share one unknown length."""
 
     fixed: np.ndarray  # (K,) s, the fixed lengths, 0 for free intervals
@@ -93,7 +93,7 @@ class Mesh(NamedTuple):
     longest: float  # s, upper bound of the unknown length
 
     @classmethod
-    def stretched(cls, count: int, seconds: float, strike: float = 0.0) -> Mesh:
+    def stretched(cls, count: int, seconds: float, strike: float = 0.0) -> LandingMesh:
         """Intervals of about like length for a landing that takes `seconds`. Those before the strike (s) are fixed."""
         before = 0
         if strike > 0:
@@ -102,7 +102,7 @@ class Mesh(NamedTuple):
         return cls(np.where(is_free, 0.0, strike / max(before, 1)), is_free, LONGEST)
 
     @classmethod
-    def periods(cls, count: int) -> Mesh:
+    def periods(cls, count: int) -> LandingMesh:
         """The environment's periods. The last one is cut short."""
         is_last = np.arange(count) == count - 1
         return cls(np.where(is_last, 0.0, PERIOD), is_last, PERIOD)
@@ -142,7 +142,7 @@ def landing_solver(lander: Lander, count: int, has_cone: bool):
     """IPOPT for a landing in `count` intervals, built once per process.
 
     - unknowns: the thrusts (3, count), the states (7, count) at the intervals' ends, the length of the free intervals
-    - parameters: state, gravity, effectiveness (3, count), `Mesh.fixed`, `Mesh.is_free`, the glide slope's tangent
+    - parameters: state, gravity, effectiveness (3, count), `fixed` and `is_free` of the mesh, the glide slope's tangent
     - cost: the propellant
     - constraints: continuous states (7 count, = 0), |thrust|^2 and |command|^2 (count each, bounded), and with
       `has_cone` the heights above the cone at the ends of all intervals but the last (count - 1)
@@ -183,7 +183,7 @@ def landing_solver(lander: Lander, count: int, has_cone: bool):
     return ca.nlpsol("landing", "ipopt", program, options)
 
 
-def bounds_of(lander: Lander, mesh: Mesh, glide_slope: float | None, limits: tuple[float, float]) -> dict:
+def bounds_of(lander: Lander, mesh: LandingMesh, glide_slope: float | None, limits: tuple[float, float]) -> dict:
     """The bounds of a program's unknowns and constraints, for CasADi's `nlpsol`. `limits` of the thrust are in N."""
     count = len(mesh.fixed)
     low = np.full((count, 7), -BOX)
@@ -261,7 +261,7 @@ def solve_from_guess(
     lander: Lander,
     descent: Descent,
     guess: Trajectory,
-    mesh: Mesh,
+    mesh: LandingMesh,
     glide_slope: float | None = 0.0,
     limits: tuple[float, float] | None = None,
 ) -> Trajectory:
@@ -318,9 +318,9 @@ def stretched_optimum(lander: Lander, descent: Descent, glide_slope: float | Non
     for share in DURATIONS:
         line = straight_line(lander, descent, share * energy_optimal, INTERVALS)
         try:
-            path = solve_from_guess(lander, known, line, Mesh.stretched(INTERVALS, line.seconds), glide_slope)
+            path = solve_from_guess(lander, known, line, LandingMesh.stretched(INTERVALS, line.seconds), glide_slope)
             if is_healthy and descent.strike < path.seconds:
-                arcs = Mesh.stretched(INTERVALS, path.seconds, descent.strike)
+                arcs = LandingMesh.stretched(INTERVALS, path.seconds, descent.strike)
                 path = solve_from_guess(lander, descent, path, arcs, glide_slope)
             return path
         except NoOptimum as error:
@@ -343,7 +343,7 @@ def held_optimum(
             failure = NoOptimum(f"landing: it takes {guess.seconds:.1f} s, longer than a flight, {lander.longest:g} s")
             break
         try:
-            tried[count] = solve_from_guess(lander, descent, guess, Mesh.periods(count), glide_slope)
+            tried[count] = solve_from_guess(lander, descent, guess, LandingMesh.periods(count), glide_slope)
         except NoOptimum as error:
             failure = error
             break
@@ -442,7 +442,7 @@ def references(env_id: str, draw: np.ndarray, processes: int = 1, **env_options)
 def kept_references(lander: Lander, rows: bytes, failure: tuple, processes: int) -> dict:
     """`references` of draws that are given as the bytes of their array. Equal flights are solved once."""
     draw = np.frombuffer(rows).reshape(-1, len(DRAW))
-    drawn = flights(lander, draw, *failure)
+    drawn = draw_flights(lander, draw, *failure)
     _, first, of_draw = np.unique(np.vstack(drawn), axis=1, return_index=True, return_inverse=True)
     jobs = [(lander, Flights(*(array[..., [k]] for array in drawn)), 0) for k in first]
     if len(jobs) > 1:

@@ -8,8 +8,6 @@ import numpy as np
 
 from common.command_line import integer
 from common.errors import refuse_unless
-from common.tasks import GroundTask, Interface
-from landing import export
 from landing.comparison import compare
 from landing.environment import fly_lander
 from landing.lander import FAILURE_TIMES, LANDERS, Lander
@@ -24,7 +22,7 @@ SOLVED = 20  # draws whose optima `baselines.py` solves unless --starts says oth
 
 
 @dataclass(frozen=True)
-class LanderTask(GroundTask):
+class LanderTask:
     """A lander in `LANDERS`: every flight has its own draw."""
 
     env_id: str
@@ -129,17 +127,6 @@ class LanderTask(GroundTask):
     def kept_arrays(self, arrays: dict) -> dict:
         """The arrays of the first `KEPT_FLIGHTS` flights. All arrays but the period are by flight."""
         return {key: array if key == "decision_s" else array[:KEPT_FLIGHTS] for key, array in arrays.items()}
-
-    # --- what is taken along
-
-    def interface(self, **env_options) -> Interface:
-        return export.interface(self.lander, **env_options)
-
-    def step_columns(self, arrays: dict, launch_longitude: float) -> dict:
-        return export.step_columns(arrays)
-
-    def flight_columns(self, arrays: dict, metrics: dict) -> dict:
-        return export.flight_columns(arrays)
 
     # --- commands
 

@@ -12,6 +12,7 @@ from gymnasium.vector import AutoresetMode
 
 from common.batch import RENDERED, BatchedEnv, SingleEnv, check_options, of_batch, refuse_autoreset
 from common.errors import BadInput, refuse_unless
+from common.flying import fly_until_ended
 from common.integration import falling_root
 from phased.problem import LARGEST_SCORE, PROBLEMS, Phase, Problem
 
@@ -444,22 +445,6 @@ def make_phased(env_id: str, **options) -> PhasedEnv:
     return PhasedEnv(make_phased_vector(env_id, **options)).sealed()
 
 
-def register_problem(problem: Problem):
-    """Make a table known to `gymnasium.make`, to the scripts and to `baselines.py`, under its `env_id`.
-
-    Raises BadInput if the id is taken.
-    """
-    taken = problem.env_id in PROBLEMS or problem.env_id in gym.registry
-    refuse_unless(not taken, "env_id", repr(problem.env_id), "is taken already; it must be an id of its own")
-    PROBLEMS[problem.env_id] = problem
-    gym.register(
-        id=problem.env_id,
-        entry_point="envs:make_phased",
-        vector_entry_point="envs:make_phased_vector",
-        kwargs={"env_id": problem.env_id},
-    )
-
-
 def fly(env_id: str, policy: Callable, x0, draw=None, **options) -> dict:
     """Fly `policy(obs (n, obs), t) -> action (n, m)` from each start x0 (n, states), and record the flights.
 
@@ -474,24 +459,19 @@ def fly(env_id: str, policy: Callable, x0, draw=None, **options) -> dict:
     x = np.full((n, T + 1, problem.states), np.nan)
     u = np.full((T, *batch.u.shape), np.nan)
     reward = np.zeros((n, T))
-    final_info = {}
-    alive = np.ones(n, dtype=bool)
     options = {"x0": x0}
     if problem.scores:
         options["draw"] = np.zeros((n, problem.scores)) if draw is None else draw
     obs, _ = batch.reset(options=options)
     x[:, 0] = np.column_stack(batch.x)  # not from obs, where the velocity may be hidden
-    for t in range(T):
-        obs, rewards, ended, final = batch.advance(policy(obs, t))
-        x[alive, t + 1] = np.column_stack(batch.x)[alive]
-        u[t, alive] = batch.u[alive]
-        reward[alive, t] = rewards[alive]
-        for key, value in final.items():
-            final_info.setdefault(key, value.copy())[alive & ended] = value[alive & ended]
-        alive &= ~ended
-        if not alive.any():
-            break
-    return {"x": x, "u": np.moveaxis(u, 0, 1), "reward": reward, **final_info}
+
+    def record(step):
+        x[step.flew, step.t + 1] = np.column_stack(batch.x)[step.flew]
+        u[step.t, step.flew] = batch.u[step.flew]
+        reward[step.flew, step.t] = step.reward[step.flew]
+
+    final = fly_until_ended(batch, policy, obs, record)
+    return {"x": x, "u": np.moveaxis(u, 0, 1), "reward": reward, **final}
 
 
 make_phased.metadata = RENDERED  # gym.make looks here before there is an environment

@@ -23,7 +23,7 @@ FIRST_STEPS = 40  # most steps of a phase with an event, while its length is unk
 HELD_TRIES = 4  # other numbers of steps that are tried when its length is known
 
 
-class Mesh(NamedTuple):
+class PhaseMesh(NamedTuple):
     """The steps into which a program cuts each phase.
 
     A phase of fixed time has steps of dt / `refine`. A phase that ends by an event has one unknown length h. It is the
@@ -36,15 +36,15 @@ class Mesh(NamedTuple):
     refine: int = 1
 
     @classmethod
-    def of(cls, problem: Problem) -> Mesh:
+    def of(cls, problem: Problem) -> PhaseMesh:
         """A problem's mesh without events, or its first one with events, which finds out how long the phases are."""
         most = FIRST_STEPS
         counts = [phase.steps if phase.end is None else min(phase.steps, most) for phase in problem.phases]
         return cls(tuple(counts), problem.has_events)
 
-    def refined(self, factor: int) -> Mesh:
+    def refined(self, factor: int) -> PhaseMesh:
         """The mesh with steps that are `factor` times shorter."""
-        return Mesh(tuple(count * factor for count in self.counts), True, factor)
+        return PhaseMesh(tuple(count * factor for count in self.counts), True, factor)
 
 
 def shooting(problem: Problem, phase: Phase, x, u, p, h, x_next):
@@ -71,10 +71,10 @@ def hermite_simpson(problem: Problem, phase: Phase, x, u, p, h, x_next):
     return defects, h / 6 * (running(x, u) + 4 * running(x_mid, u) + running(x_next, u))
 
 
-def program(problem: Problem, mesh: Mesh, defect: Callable, in_circles: bool):
+def program(problem: Problem, mesh: PhaseMesh, defect: Callable, in_circles: bool):
     """The nonlinear program as CasADi symbols, and the bounds of its constraints: (symbols, lbg, ubg).
 
-    - unknowns: the controls u_0..u_{T-1}, m each, the states x_1..x_T, n each, and the lengths h of `Mesh`
+    - unknowns: the controls u_0..u_{T-1}, m each, the states x_1..x_T, n each, and the lengths h of `PhaseMesh`
     - parameters: x_0 and the hidden parameters
     - cost: J of `phased/environment.py`, which is the paper's "J" as a sum over steps
     - constraints: the defects (n T of them, = 0); with `in_circles` the sum of (dx / r)^2 at each phase's end (<= 1);
@@ -135,7 +135,7 @@ def program(problem: Problem, mesh: Mesh, defect: Callable, in_circles: bool):
 
 
 @cache
-def solver(problem: Problem, mesh: Mesh, defect: Callable, in_circles: bool):
+def solver(problem: Problem, mesh: PhaseMesh, defect: Callable, in_circles: bool):
     """IPOPT for `program`, built once per process: its CasADi function, and the arguments that all starts share.
 
     Raises NoOptimum if the table's functions make no program.
@@ -195,7 +195,7 @@ def lasting(times: np.ndarray, u: np.ndarray) -> np.ndarray:
     return u[np.minimum((middle * len(u)).astype(int), len(u) - 1)]
 
 
-def placed(problem: Problem, mesh: Mesh, sketches: list[Sketch]) -> np.ndarray:
+def placed(problem: Problem, mesh: PhaseMesh, sketches: list[Sketch]) -> np.ndarray:
     """The unknowns of a mesh, interpolated from the sketches of the phases."""
     controls, states, lengths = [], [], []
     for phase, count, sketch in zip(problem.phases, mesh.counts, sketches):
@@ -212,7 +212,7 @@ def placed(problem: Problem, mesh: Mesh, sketches: list[Sketch]) -> np.ndarray:
     return np.concatenate([np.vstack(controls).ravel(), np.vstack(states).ravel(), lengths])
 
 
-def sketches_of(problem: Problem, mesh: Mesh, x0, solution: np.ndarray) -> list[Sketch]:
+def sketches_of(problem: Problem, mesh: PhaseMesh, x0, solution: np.ndarray) -> list[Sketch]:
     """The unknowns of a solution by phase. `placed` turns them into those of another mesh."""
     T, n, m = sum(mesh.counts), problem.states, problem.controls
     u = solution[: m * T].reshape(T, m)
@@ -322,7 +322,7 @@ def flown_sketches(problem: Problem, policy, x0, draw) -> list[Sketch] | None:
     return [Sketch(u[a:b], x[a : b + 1], (b - a) * problem.dt) for a, b in pieces]
 
 
-class Job(NamedTuple):
+class StartJob(NamedTuple):
     """A start that is to be solved, with all that a process needs."""
 
     env_id: str
@@ -336,7 +336,7 @@ class Job(NamedTuple):
 class Solution(NamedTuple):
     """What IPOPT found on a mesh."""
 
-    mesh: Mesh
+    mesh: PhaseMesh
     unknowns: np.ndarray
     cost: float
     multipliers: np.ndarray  # of the circles' constraints
@@ -348,7 +348,7 @@ class Solution(NamedTuple):
         return self.status in ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 
 
-def solve_on(problem: Problem, mesh: Mesh, job: Job, sketches: list[Sketch]) -> Solution:
+def solve_on(problem: Problem, mesh: PhaseMesh, job: StartJob, sketches: list[Sketch]) -> Solution:
     """Solve a job on a mesh, from a guess."""
     solve, arguments = solver(problem, mesh, job.defect, job.in_circles)
     p = [float(value[0]) for value in problem.hidden(job.draw[None])]
@@ -364,7 +364,7 @@ def solve_on(problem: Problem, mesh: Mesh, job: Job, sketches: list[Sketch]) -> 
     return Solution(mesh, unknowns, float(found["f"]), multipliers, bound_price, status)
 
 
-def held_steps(problem: Problem, job: Job, stretched: Solution) -> Solution:
+def held_steps(problem: Problem, job: StartJob, stretched: Solution) -> Solution:
     """The solution in the environment's own steps, from a stretched one that has found out how long the phases are.
 
     The number of steps is first that of the stretched solution. If the last step of a phase has the length 0 or dt, one
@@ -376,7 +376,7 @@ def held_steps(problem: Problem, job: Job, stretched: Solution) -> Solution:
         whole = int(np.ceil(sketch.seconds / problem.dt - 1e-9))
         return phase.steps if phase.end is None else min(max(whole, 1), phase.steps)
 
-    mesh = Mesh(tuple(steps_of(sketch, phase) for sketch, phase in zip(sketches, problem.phases)))
+    mesh = PhaseMesh(tuple(steps_of(sketch, phase) for sketch, phase in zip(sketches, problem.phases)))
     best = solve_on(problem, mesh, job, sketches)
     for _ in range(HELD_TRIES):
         sketches = sketches_of(problem, best.mesh, job.x0, best.unknowns)
@@ -389,7 +389,7 @@ def held_steps(problem: Problem, job: Job, stretched: Solution) -> Solution:
                 counts[k] = min(counts[k] + 1, phase.steps)  # held steps need more time than stretched ones
         if tuple(counts) == best.mesh.counts:
             break
-        other = solve_on(problem, Mesh(tuple(counts)), job, sketches)
+        other = solve_on(problem, PhaseMesh(tuple(counts)), job, sketches)
         if other.succeeded and not (best.succeeded and best.cost <= other.cost):
             best = other
         elif best.succeeded:
@@ -398,13 +398,13 @@ def held_steps(problem: Problem, job: Job, stretched: Solution) -> Solution:
 
 
 @interruptible()
-def best_solution(job: Job) -> tuple[Solution, bool]:
+def best_solution(job: StartJob) -> tuple[Solution, bool]:
     """The best solution of a start's guesses in the environment's steps, and whether IPOPT succeeded.
 
     Raises NoOptimum if no guess leads to a solution, unless circles, bounds or events are out of reach.
     """
     problem = PROBLEMS[job.env_id]
-    mesh = Mesh.of(problem)
+    mesh = PhaseMesh.of(problem)
     found: list[Solution] = []
     for guess in guesses(problem, job.x0, job.draw):
         solution = solve_on(problem, mesh, job, guess)
@@ -422,7 +422,7 @@ def best_solution(job: Job) -> tuple[Solution, bool]:
 
 
 @interruptible()
-def refined(job: Job, best: Solution, factor: int) -> Solution:
+def refined(job: StartJob, best: Solution, factor: int) -> Solution:
     """The solution in steps that are `factor` times shorter, with the job's defect, from the start's best solution."""
     problem = PROBLEMS[job.env_id]
     sketches = sketches_of(problem, best.mesh, job.x0, best.unknowns)

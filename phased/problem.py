@@ -14,6 +14,7 @@ import numpy as np
 
 from common.errors import refuse_unless
 from common.integration import rk4
+from common.registration import register
 from phased.checks import check_problem
 
 LARGEST_SCORE = 3.0  # standard scores are drawn within +-3
@@ -311,7 +312,16 @@ class Tables(dict[str, Problem]):
         super().__setitem__(env_id, problem)
 
 
-PROBLEMS = Tables()  # `register_problem` of `environment.py` fills it
+PROBLEMS = Tables()  # `register_problem` fills it
+
+
+def register_problem(problem: Problem):
+    """Make a table known to `gymnasium.make`, to the scripts and to `baselines.py`, under its `env_id`.
+
+    Its environment (`environment.py`) is imported when one is made. Raises BadInput if the id is taken.
+    """
+    register(problem.env_id, "make_phased")
+    PROBLEMS[problem.env_id] = problem
 
 
 def starts(seed: int, n: int, x0_max: float | tuple[float, ...] = 1.0) -> np.ndarray:

@@ -8,13 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.command_line import integer
-from common.errors import BadInput
-from common.tasks import Interface, SampledTask
-from pages.assemble import Page
-from phased import export
+from common.tasks import SampledTask
 from phased.environment import fly
 from phased.metrics import flight_metrics, near_origin_metrics, ratio_metrics
-from phased.page import page as problem_page
 from phased.problem import Problem, flights_of_seed
 from phased.table import table
 
@@ -140,20 +136,6 @@ class PhasedTask(SampledTask):
         """The arrays of the first `KEPT_STARTS` starts. All arrays but the times are by start."""
         return {key: array if key == "t" else array[:KEPT_STARTS] for key, array in arrays.items()}
 
-    # --- what is taken along
-
-    def interface(self, **env_options) -> Interface:
-        return export.interface(self.problem, **env_options)
-
-    def step_columns(self, arrays: dict, launch_longitude: float) -> dict:
-        return export.step_columns(self.problem, arrays)
-
-    def flight_columns(self, arrays: dict, metrics: dict) -> dict:
-        return export.flight_columns(self.problem, arrays)
-
-    def page(self, metrics: dict, arrays: dict, checkpoint: dict, launch_longitude: float) -> Page:
-        return problem_page(self.problem, arrays, checkpoint)
-
     # --- commands
 
     def speed_cases(self) -> list[tuple[str, dict, list | None]]:
@@ -165,6 +147,3 @@ class PhasedTask(SampledTask):
 
     def baseline_command(self, args) -> tuple[dict, dict]:
         return self.report(self.env_id, args.starts, args.seed)
-
-    def fly_opponents(self, folder, **options) -> None:
-        raise BadInput(f"the env_id of {folder} is {self.env_id}; it must be a rocket's with cut-off or a lander's")

@@ -22,6 +22,7 @@ import numpy as np
 from common.checkpoints import read_checkpoint
 from common.errors import refuse_unless
 from common.files import write_json, write_npz
+from common.flying import decision_us
 from common.policies import evaluate_by_script
 from rocket import guidance
 from rocket.dispersion import draw_vehicles
@@ -32,7 +33,6 @@ from rocket.metrics import (
     AT_ONCE,
     SUCCESS,
     chosen,
-    decision_us,
     dispersed_metrics,
     draws,
     evaluate_dispersed,

@@ -1,25 +1,23 @@
-"""The rockets' environment, and how an id is registered.
+"""The rockets' environment.
 
-Reading order: the steps, the batched environment (draws, observations, flight between events, cut-off, reward), the
-single environment, one recorded flight, registration.
+Reading order: the batched environment (draws, observations, step, reward), the single environment, one recorded flight.
+`flight.py` has the flight within a step.
 """
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
-from dataclasses import fields, replace
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.envs.registration import ENV_ID_RE
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
 
 from common.batch import RENDERED, BatchedEnv, SingleEnv, check_options, of_batch, refuse_autoreset
 from common.errors import BadInput, refuse_unless
-from common.integration import rk4
+from common.flying import fly_until_ended
 from rocket.dispersion import (
     DISPERSION,
     LARGEST_DISPERSION,
@@ -30,8 +28,8 @@ from rocket.dispersion import (
     largest_draw,
     nominal_vehicles,
 )
-from rocket.dynamics import ascent_dynamics
 from rocket.failure import FAILURE_DRAW, HEALTHY_DRAW, check_failure, failure_scores
+from rocket.flight import Fleet, Steps, cut_off, fly_step, steps_at, steps_until, unit_directions
 from rocket.missions import PAPER_MISSION, ROCKETS, Mission
 from rocket.navigation import LARGEST_SCORE as LARGEST_NOISE_SCORE
 from rocket.navigation import OBSERVED, checked_noise, deviations
@@ -57,30 +55,6 @@ from rocket.rewards import (
 from rocket.vehicle import Rocket, delta_v
 
 ACTION_FRAMES = ("eci", "local")
-STIFF = 0.25  # a step is cut where rho Cd S |v| / m times the step, drag's derivative by the speed, exceeds this
-
-
-class Schedule(NamedTuple):
-    """When the N running steps are flown, (N,) each."""
-
-    begin: np.ndarray  # s
-    end: np.ndarray  # s
-    phi: np.ndarray  # the phase before the step, 0 to 1
-    arc: np.ndarray  # the arc in which the step begins, an index of the arcs of `Vehicles`
-
-
-class Steps(NamedTuple):
-    """The steps that n environments are flying."""
-
-    u: np.ndarray  # (3, n) thrust directions in ECI, held over the step
-    begin: np.ndarray  # (n,) s, when the step begins, or the arc that begins within it
-    end: np.ndarray  # (n,) s, when the whole step ends
-    who: np.ndarray  # (n,) the environments' indices
-    arc: np.ndarray  # (n,) the arc at `begin`
-
-    def of(self, chosen) -> Steps:
-        """The steps of the chosen environments, indices or a mask of n."""
-        return Steps(*(column[..., chosen] for column in self))
 
 
 class RocketVectorEnv(BatchedEnv):
@@ -125,13 +99,13 @@ class RocketVectorEnv(BatchedEnv):
     Reward: the sum of R_orbital, R_trajectory, R_guidance, R_penalties and R_terminal, which are functions of
     `rewards.py`. `final_info` has, (N,) each unless a shape is given:
 
+    - `final_y` (N, 7), the exact r, v and m
     - `error_norm`, and `error` (N, 6), the terminal error in ECI
     - `a_km e i_deg raan_deg argp_deg final_mass_kg final_time_s`
     - `max_altitude_km`, of the steps' ends
     - the sums of the five parts, `episodic_return`, `points` (`precision_points`) and `crashed`
     - with dispersion or failures `draw` (N, k), and `dry` for a flight that is out of fuel
     - with failures `failure` (N, 3): group of engines, moment (s) and share lost; -1, 0, 0 for a healthy flight
-    - with navigation noise `final_y` (N, 7), the exact r, v and m
 
     A training may set these attributes before a `reset`:
 
@@ -256,15 +230,14 @@ class RocketVectorEnv(BatchedEnv):
         # without draws all flights have the same steps, which are worked out once for the one vehicle
         self._table = None
         if not self.has_draws:
-            *clock, arc = self._work_out(np.arange(self.episode_steps + 1), self._largest)
-            self._table = np.array(clock), arc
+            self._table = steps_at(np.arange(self.episode_steps + 1), self._largest, self._latest, self._steps, self.dt)
         self._set_ends(self.vehicles)
 
     def _set_ends(self, vehicles):
         """Set when the episodes of these vehicles end at the latest. Returns the number of their steps."""
         own = self.has_draws and self.cutoff and self._end_time == self.rocket.end_time == self.rocket.burns[-1].end
         self._latest = vehicles.burn_out if own else np.full(len(vehicles.mass), self._end_time)  # s
-        self._steps = np.maximum(np.ceil(self._latest / self.rocket.dt - 1e-9), 1.0).astype(np.int64)
+        self._steps = steps_until(self._latest, self.dt)
         return self._steps
 
     def _start(self, mask, options):
@@ -395,7 +368,7 @@ class RocketVectorEnv(BatchedEnv):
             obs[:, 9:] = self.draw[:, : self._scores_drawn]
         if self.has_draws and not self.observe_mass:
             obs[:, 6] = self._computed_mass()
-        phi = self._schedule().phi
+        phi = self.phase / max(self._last_phase, 1)
         obs[:, 7] = (1 - self.time / self.rocket.end_time) * self.observe_phase
         obs[:, 8] = phi * self.observe_phase
         return obs
@@ -408,24 +381,14 @@ class RocketVectorEnv(BatchedEnv):
     @property
     def phase(self) -> np.ndarray:
         """The 0-based phase (N,) in which the running steps begin: a burn is a phase."""
-        return self.vehicles.burn[self._schedule().arc, self._everyone]
+        return self.vehicles.burn[self._running_steps().arc, self._everyone]
 
-    def _schedule(self) -> Schedule:
-        """The schedule of the running steps."""
+    def _running_steps(self) -> Steps:
+        """The steps that the environments fly next."""
         if self._table is None:
-            return self._work_out(self.t, self.vehicles)
-        clock, arc = self._table
-        begin, end, phi = clock[:, self.t]
-        return Schedule(begin, end, phi, arc[self.t])
-
-    def _work_out(self, t, vehicles) -> Schedule:
-        """The schedule of the steps t (N,) of these vehicles. After an episode's last step phi keeps its value."""
-        dt, ends = self.rocket.dt, vehicles.end
-        begin = np.where(t >= self._steps, self._latest, dt * t)
-        end = np.where(t + 1 >= self._steps, self._latest, dt * (t + 1))
-        arc = (ends <= dt * np.minimum(t, self._steps - 1)).sum(axis=0)
-        phi = vehicles.burn[arc, np.arange(vehicles.burn.shape[1])] / max(self._last_phase, 1)
-        return Schedule(begin, end, phi, arc)
+            return steps_at(self.t, self.vehicles, self._latest, self._steps, self.dt)
+        table, t = self._table, self.t
+        return Steps(table.begin[t], table.end[t], table.arc[t], self._everyone)
 
     def _computed_mass(self):
         """The flight computer's mass (N,) in kg. It follows the nominal burn from the last staging on."""
@@ -436,12 +399,11 @@ class RocketVectorEnv(BatchedEnv):
 
     def _directions(self, actions):
         """Unit thrust directions in ECI (3, N) of actions (N, 3). Raises BadInput for the first of length zero."""
-        largest = np.abs(actions).max(axis=1)
-        if not largest.all():
-            bad = int(np.argmin(largest))
+        has_length = actions.any(axis=1)
+        if not has_length.all():
+            bad = int(np.argmin(has_length))
             raise BadInput(f"action of env {bad} at step {self.t[bad]} is [0, 0, 0]; a direction must have a length")
-        u = actions.T / largest  # so that squares neither overflow nor underflow
-        u /= np.sqrt((u * u).sum(axis=0))
+        u = unit_directions(actions)
         if self.action_frame == "eci":
             return u
         up, along, cross = local_frame(self.y, self._axes[2])
@@ -451,120 +413,28 @@ class RocketVectorEnv(BatchedEnv):
         t = self.t
         u = self._directions(actions)
         before = self.y
-        begin, end, _, arc = self._schedule()
-        duration = end - begin
-        phase = self.vehicles.burn[arc, self._everyone]
+        fleet = Fleet(self.rocket, self.vehicles, bool(self.dispersion))
+        steps = self._running_steps()
+        duration = steps.end - steps.begin
+        phase = self.vehicles.burn[steps.arc, steps.who]
         done = t + 1 == self._steps
-        steps = Steps(u, begin, end, self._everyone, arc)
-        self.y = self._fly(before, steps, duration)
+        self.y = fly_step(fleet, before, u, steps, duration)
         if self.cutoff:
             energy = specific_energy(self.y, self.rocket.mu)
             reached = (phase == self._last_phase) & (energy >= self.rocket.target_energy)
             if reached.any():
-                cut = self._cut_off(before[:, reached], self.y[:, reached], steps.of(reached), duration[reached])
+                ends = before[:, reached], self.y[:, reached]
+                cut = cut_off(fleet, *ends, u[:, reached], steps.of(reached), duration[reached])
                 self.y[:, reached], duration[reached] = cut
             done = done | reached
         altitude = np.sqrt((self.y[:3] ** 2).sum(axis=0)) - self.rocket.Re
         self._crashed = altitude < 0
         done = done | self._crashed
-        self.time = begin + duration
+        self.time = steps.begin + duration
         self._max_altitude = np.maximum(self._max_altitude, altitude)
         rewards = self._reward(before, u, phase, altitude, done)
         self.u, self.t = u, t + 1
         return rewards, done, self._final_info
-
-    def _fly(self, y, steps, duration):
-        """The states (7, n) at `duration` (n,) s after the begin of these steps. y (7, n) are the states at the begin.
-
-        Each round flies to the next event or to the end of the duration. Flights that met an event drop their mass and
-        go on in the next arc.
-        """
-        flown, flying = None, None  # (7, n), and its columns that are still flying; None: all of them
-        while True:
-            event = self.vehicles.end[steps.arc, steps.who]
-            until_event = event - steps.begin
-            y = self._fly_arc(y, steps, np.minimum(duration, until_event))
-            if flown is None:
-                flown = y
-            else:
-                flown[:, flying] = y
-            met = np.flatnonzero(event <= steps.end)
-            if len(met):
-                # durations are rounded; an event at the very end of the step counts as met, as in the next step
-                met = met[(duration >= until_event - 1e-9)[met]]
-            if not len(met):
-                return flown
-            flying = met if flying is None else flying[met]
-            y = y[:, met]
-            y[6] -= self.vehicles.dropped[steps.arc[met], steps.who[met]]
-            duration = np.maximum((duration - until_event)[met], 0.0)
-            steps = steps.of(met)._replace(begin=event[met], arc=steps.arc[met] + 1)
-
-    def _fly_arc(self, y, steps, dt):
-        """The states (7, n) after dt (n,) seconds without an event, by one RK4 step.
-
-        A plunge into dense air takes several RK4 steps, because drag is stiff there. Its rate times the step, at the
-        lowest altitude that the step can reach, is kept below `STIFF`. No ascent comes near this limit. Without it a
-        crash at orbital speed would end in meaningless numbers.
-        """
-        rocket, arc, who = self.rocket, steps.arc, steps.who
-        controls = (*steps.u, self.vehicles.thrust[arc, who], self.vehicles.flow[arc, who])
-        drag, wind = None, None
-        if self.dispersion:
-            drag = self.vehicles.drag[who]
-            wind = self.vehicles.wind[:, who]
-        # with the state as one component (7, n), rk4 takes a seventh of the array operations
-        f = lambda x, u: (np.array(ascent_dynamics(x[0], u, rocket, wind, drag)),)  # noqa: E731
-        speed = np.sqrt((y[3:6] ** 2).sum(axis=0))
-        lowest = np.maximum(np.sqrt((y[:3] ** 2).sum(axis=0)) - rocket.Re - speed * dt, 0.0)
-        rate = rocket.rho0 * np.exp(-lowest / rocket.H) * rocket.Cd * rocket.S * speed / y[6]
-        if self.dispersion:
-            rate = drag * rate
-        (y_next,) = rk4(f, (y,), controls, dt)
-        stiff = np.flatnonzero(rate * dt > STIFF)
-        if len(stiff):
-            n = np.ceil((rate * dt)[stiff] / STIFF)  # each flight's own number, which no other flight changes
-            y_sub = y[:, stiff]
-            controls = tuple(c[stiff] for c in controls)
-            dt = dt[stiff] / n
-            if drag is not None and wind is not None:
-                drag = drag[stiff]
-                wind = wind[:, stiff]
-            for k in range(int(n.max())):
-                aloft = (y_sub[:3] ** 2).sum(axis=0) >= rocket.Re**2  # a flight below the ground stays there
-                y_sub = np.where(aloft & (k < n), rk4(f, (y_sub,), controls, dt)[0], y_sub)
-            y_next[:, stiff] = y_sub
-        return y_next
-
-    def _cut_off(self, before, after, steps, duration):
-        """The states (7, n) and times (n,), in s after the begin of the steps, at which the energy is the target's.
-
-        before and after (7, n) are the states at the begin and `duration` (n,) s later, when the energy has been
-        passed. The method is regula falsi with the Illinois change (Dowell and Jarratt, 1971): if the same end of the
-        bracket is replaced twice, the other end's value is halved. The energy grows almost linearly in a step, so four
-        evaluations reach rounding. All rows take six, so that no row depends on the rest of the batch.
-        """
-
-        def excess(y):
-            return specific_energy(y, self.rocket.mu) - self.rocket.target_energy
-
-        low, high = np.zeros(len(duration)), duration
-        f_low = np.minimum(excess(before), -1e-300)  # a flight that begins beyond the energy is cut off there
-        f_high = excess(after)
-        replaced_high = np.full(len(duration), -1)  # whether the last round replaced `high`; -1 before the first
-        y, time = after, duration
-        for _ in range(6):
-            time = low - f_low * (high - low) / (f_high - f_low)
-            y = self._fly(before, steps, time)
-            f = excess(y)
-            above = f >= 0
-            divisor = 1 + (above == replaced_high)
-            f_low = np.where(above, f_low / divisor, f)
-            f_high = np.where(above, f, f_high / divisor)
-            low = np.where(above, low, time)
-            high = np.where(above, time, high)
-            replaced_high = above
-        return y, time
 
     def _reward(self, before, u, phase, altitude, done):
         """Add the five parts of this step to their sums. Returns the reward (N,): their total.
@@ -602,7 +472,13 @@ class RocketVectorEnv(BatchedEnv):
         error = terminal_error(y, self.rocket)
         elements = orbital_elements(y, self.rocket.mu)
         error_norm = np.sqrt((error * error).sum(axis=1))
-        info = {"error": error, "error_norm": error_norm, "a_km": elements.a / 1e3, "e": elements.e}
+        info = {
+            "final_y": y.copy(),
+            "error": error,
+            "error_norm": error_norm,
+            "a_km": elements.a / 1e3,
+            "e": elements.e,
+        }
         info |= {f"{name}_deg": np.degrees(getattr(elements, name)) for name in ("i", "raan", "argp")}
         info |= {"final_mass_kg": self.y[6].copy(), "final_time_s": self.time.copy(), "crashed": self._crashed.copy()}
         info |= {"max_altitude_km": self._max_altitude / 1e3, "points": precision_points(error_norm)}
@@ -610,8 +486,6 @@ class RocketVectorEnv(BatchedEnv):
             info |= {"draw": self.draw.copy(), "dry": self.time >= self.vehicles.burn_out - 1e-6}
         if self.failure:
             info["failure"] = self.vehicles.failure.T.copy()
-        if self.navigation_noise:
-            info["final_y"] = y.copy()
         return info | dict(zip(self.PARTS, self._parts.copy())) | {"episodic_return": self._parts.sum(axis=0)}
 
     def _snapshot(self):
@@ -696,46 +570,17 @@ def fly_rocket(
     obs, _ = env.reset(options=given)
     t, y = [0.0], [env.y[:, 0].copy()]
     u, rewards, parts = [], [], []
-    final = {}
-    while not final:
-        obs, reward, _, final = env.advance(policy(obs, len(u)))
+
+    def record(step):
         t.append(env.time[0])
         u.append(env.u[:, 0])
         y.append(env.y[:, 0].copy())
-        rewards.append(reward[0])
+        rewards.append(step.reward[0])
         parts.append(env._parts[:, 0].copy())
-    final = {key: value[0] for key, value in final.items()}
+
+    final = {key: value[0] for key, value in fly_until_ended(env, policy, obs, record).items()}
     flight = {"t": np.array(t), "u": np.array(u), "y": np.array(y), "reward": np.array(rewards)}
     return {**flight, "parts": np.array(parts), **final}
 
 
 make_rocket.metadata = RENDERED  # gym.make looks here before there is an environment
-
-
-def register_rocket(env_id: str, rocket: Rocket, cutoff: bool = False, ceiling_km: float | None = None, **rules):
-    """Register a rocket as an environment id, which `ppo_gtrxl_rocket.py`, evaluations and references then take, too.
-
-    `cutoff`, `ceiling_km` and `rules` are the fields of `Mission`. An id that is registered already is replaced. A
-    warning says so if it was another rocket's. Raises BadInput if the id is another environment's or not in Gymnasium's
-    form.
-    """
-    others = gym.registry.keys() - ROCKETS.keys()
-    if env_id in others or not ENV_ID_RE.fullmatch(env_id) or "/" in env_id:
-        raise BadInput(f"env_id is {env_id!r}; it must be a new id such as MyRocket-v0")
-    names = [field.name for field in fields(Mission)]
-    for name in rules.keys() - set(names):
-        raise BadInput(f"register_rocket has no keyword {name!r}; it must be one of {', '.join(names)}")
-    mission = Mission(rocket, cutoff, ceiling_km, **rules)
-    if ROCKETS.get(env_id, mission) != mission:
-        warnings.warn(f"{env_id} was another rocket's id; from here on it is this one's", stacklevel=2)
-    gym.registry.pop(env_id, None)
-    try:
-        gym.register(
-            id=env_id,
-            entry_point="envs:make_rocket",
-            vector_entry_point="envs:make_rocket_vector",
-            kwargs={"env_id": env_id},
-        )
-    except gym.error.Error as error:  # the name of another environment without its version
-        raise BadInput(f"env_id is {env_id!r}; it must be a new id such as MyRocket-v0: {error}") from error
-    ROCKETS[env_id] = mission

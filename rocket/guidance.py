@@ -18,7 +18,6 @@ knows the draw. CasADi is imported only where it solves.
 from __future__ import annotations
 
 import time
-from dataclasses import replace
 from functools import cache
 from typing import NamedTuple
 
@@ -27,9 +26,9 @@ import numpy as np
 from common.errors import NoOptimum
 from common.ipopt import interruptible
 from common.workers import Workers
-from rocket.dispersion import draw_vehicles
+from rocket.dispersion import draw_vehicles, nominal_vehicles
 from rocket.dynamics import ascent_dynamics
-from rocket.environment import RocketVectorEnv
+from rocket.flight import Fleet, fly_step, steps_at, steps_until, unit_directions
 from rocket.missions import ROCKETS, Mission
 from rocket.optimum import (
     GAUSS_POINTS,
@@ -89,19 +88,21 @@ def linearise_flight(mission: Mission, flight: dict, axes):
     """A (K, 6, 6) and B (K, 6, 2) of dx_{k+1} = A_k dx_k + B_k da_k along a flight, for the environment's own steps.
 
     x is r (m) and v (m/s). a are the two angles (rad) towards axes (K, 2, 3). The derivatives are central differences
-    of the nominal environment with its events. The 16 neighbours of a state are one batch.
+    of the nominal vehicle's steps with their events. The 16 neighbours of a state fly together.
     """
     h = np.repeat([10.0, 0.01, 1e-4], [3, 3, 2])
     shifts = np.concatenate([np.diag(h), -np.diag(h)])  # (16, 8)
-    env = RocketVectorEnv(len(shifts), replace(mission, cutoff=False))
-    env.end_time = flight["t"][-1]
-    env.reset()
+    dt = mission.rocket.dt
+    fleet = Fleet(mission.rocket, nominal_vehicles(mission.rocket, len(shifts)), has_own_air=False)
+    latest = np.full(len(shifts), flight["t"][-1])
+    count = steps_until(latest, dt)
     jacobians = []
     for k, (y, u) in enumerate(zip(flight["y"], flight["u"])):
-        env.t[:] = k
-        env.y = y[:, None] + np.pad(shifts[:, :6], ((0, 0), (0, 1))).T
-        env.advance(turned(u, axes[k], shifts[:, 6:]))
-        ahead, behind = env.y[:6, :8], env.y[:6, 8:]
+        steps = steps_at(k, fleet.vehicles, latest, count, dt)
+        y_near = y[:, None] + np.pad(shifts[:, :6], ((0, 0), (0, 1))).T
+        u_near = unit_directions(turned(u, axes[k], shifts[:, 6:]))
+        y_next = fly_step(fleet, y_near, u_near, steps, steps.end - steps.begin)
+        ahead, behind = y_next[:6, :8], y_next[:6, 8:]
         jacobians.append((ahead - behind) / (2 * h))
     AB = np.array(jacobians)
     return AB[..., :6], AB[..., 6:]

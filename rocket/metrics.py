@@ -7,15 +7,15 @@ has its own vehicle and air, and some have a failure, so statistics measure a po
 
 from __future__ import annotations
 
-import time
 from functools import partial
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
+from common.flying import fly_until_ended
 from rocket.dispersion import draw_bounds
-from rocket.environment import RocketVectorEnv, fly_rocket
+from rocket.environment import RocketVectorEnv
 from rocket.failure import failure_scores
 from rocket.missions import ROCKETS, Mission
 from rocket.navigation import flight_noise
@@ -173,20 +173,7 @@ def fly_dispersed(env_id: str, policy, z: np.ndarray, dispersion: float, noise=N
     if noise is not None and batch.navigation_noise:
         given["noise"] = noise(batch.episode_steps + 1)
     obs, _ = batch.reset(options=given)
-    alive = np.ones(len(z), dtype=bool)
-    ends = {}
-    t = 0
-    while alive.any():
-        obs, _, terminated, _, info = batch.step(policy(obs, t))
-        ended = alive & terminated  # an ended environment starts a new flight, which does not count
-        t += 1
-        if ended.any():
-            # with navigation noise the observation is not the state, and `final_info` has the state as final_y
-            final = {"final_y": info["final_obs"][:, :7], **info["final_info"]}
-            for key, value in final.items():
-                ends.setdefault(key, np.zeros_like(value))[ended] = value[ended]
-        alive = alive & ~terminated
-    ends["final_y"][:, 6] = ends["final_mass_kg"]  # the observed mass is the flight computer's
+    ends = fly_until_ended(batch, policy, obs, restart=True)
     return ends | {"final_t": ends["final_time_s"], "final_error": ends["error"]}
 
 
@@ -276,17 +263,3 @@ def final_elements(y: np.ndarray, rocket: Rocket) -> dict:
     elements = orbital_elements(y, rocket.mu)
     degrees = {f"{name}_deg": np.degrees(getattr(elements, name)) for name in ("i", "raan", "argp")}
     return {"a_km": elements.a / 1e3, "e": elements.e, **degrees}
-
-
-def decision_us(env_id: str, policy, **env_options) -> float:
-    """The median time in microseconds, on one core, of a policy's decision in a flight that is alone in its batch."""
-    seconds = []
-
-    def timed(obs, t):
-        begin = time.process_time()
-        action = policy(obs, t)
-        seconds.append(time.process_time() - begin)
-        return action
-
-    fly_rocket(env_id, timed, **env_options)
-    return 1e6 * float(np.median(seconds))

@@ -2,15 +2,19 @@
 
 Environments, references, evaluations, figures and the script read `ROCKETS`. `register_rocket` adds to it. The target
 orbit is a field of `Rocket` (`vehicle.py`). `metrics.py` says what counts as a success.
+
+Registering a rocket needs this table alone. Its environment (`environment.py`) is imported when one is made.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import warnings
+from dataclasses import dataclass, fields
 
 import numpy as np
 
-from common.errors import is_finite, refuse_unless
+from common.errors import BadInput, is_finite, refuse_unless
+from common.registration import register
 from rocket.vehicle import ROCKET, Rocket
 
 
@@ -47,3 +51,20 @@ class Mission:
 # wasted, and too flat a climb wastes it as well: with a floor of 110 km two of three seeds flew along the floor.
 PAPER_MISSION = Mission(ROCKET, ceiling_km=250.0, floor_km=130.0, guided_until=ROCKET.burns[1].end, mass_unit=100.0)
 ROCKETS: dict[str, Mission] = {}  # by environment id; `envs.py` and the files of `vehicles/` fill it
+
+
+def register_rocket(env_id: str, rocket: Rocket, cutoff: bool = False, ceiling_km: float | None = None, **rules):
+    """Register a rocket as an environment id, which `ppo_gtrxl_rocket.py`, evaluations and references then take, too.
+
+    `cutoff`, `ceiling_km` and `rules` are the fields of `Mission`. An id that is registered already is replaced. A
+    warning says so if it was another rocket's. Raises BadInput if the id is another environment's or not in Gymnasium's
+    form.
+    """
+    names = [field.name for field in fields(Mission)]
+    for name in rules.keys() - set(names):
+        raise BadInput(f"register_rocket has no keyword {name!r}; it must be one of {', '.join(names)}")
+    mission = Mission(rocket, cutoff, ceiling_km, **rules)
+    register(env_id, "make_rocket", replaceable=ROCKETS)
+    if ROCKETS.get(env_id, mission) != mission:
+        warnings.warn(f"{env_id} was another rocket's id; from here on it is this one's", stacklevel=2)
+    ROCKETS[env_id] = mission

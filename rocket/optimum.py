@@ -58,7 +58,7 @@ ASCENTS = {
 }
 
 
-class Mesh(NamedTuple):
+class AscentMesh(NamedTuple):
     """An ascent cut into n intervals, at least at every event. Times are in s, for the guessed final time."""
 
     t: np.ndarray  # (n+1,) the intervals' ends
@@ -74,7 +74,7 @@ def state_scale(rocket: Rocket):
     return np.repeat([rocket.Re, np.sqrt(rocket.mu / rocket.Re)], 3)
 
 
-def collocation_mesh(case: AscentCase, end: float, segments: int) -> Mesh:
+def collocation_mesh(case: AscentCase, end: float, segments: int) -> AscentMesh:
     """About `segments` intervals of like length, a whole number in each arc. The last arc's stretch with the end."""
     arcs = [arc for arc in case.rocket.arcs() if arc[0] < end]
     start = arcs[-1][0]
@@ -87,10 +87,10 @@ def collocation_mesh(case: AscentCase, end: float, segments: int) -> Mesh:
     t = np.concatenate([[0.0], *pieces])
     t_u = (t[:-1, None] + np.diff(t)[:, None] * GAUSS_POINTS).ravel()
     stretch = np.clip((t - start) / (end - start), 0.0, 1.0)
-    return Mesh(t, stretch, t_u, np.arange(len(t_u)), (start, stop), len(GAUSS_POINTS))
+    return AscentMesh(t, stretch, t_u, np.arange(len(t_u)), (start, stop), len(GAUSS_POINTS))
 
 
-def zero_order_hold_mesh(rocket: Rocket, end: float, free: bool = False) -> Mesh:
+def zero_order_hold_mesh(rocket: Rocket, end: float, free: bool = False) -> AscentMesh:
     """The environment's steps until `end`, cut at the events, with one direction for each step.
 
     With a free end the last interval stretches, within its step and up to the rocket's end_time.
@@ -103,7 +103,7 @@ def zero_order_hold_mesh(rocket: Rocket, end: float, free: bool = False) -> Mesh
     if free:
         stretch[-1] = 1.0
         final_time = (t[-2], min(t_u[-1] + rocket.dt, rocket.end_time))
-    return Mesh(t, stretch, t_u, column, final_time, 0)
+    return AscentMesh(t, stretch, t_u, column, final_time, 0)
 
 
 def collocation(rocket: Rocket, in_wind: bool = False):
@@ -172,7 +172,7 @@ def orbit_defect(rocket: Rocket, x, h_target, e_target):
     return ca.vertcat((h - h_target) / ca.norm_2(h_target), ca.DM(target_axes(rocket)[:2]) @ (e - e_target))
 
 
-def ascent_program(case: AscentCase, mesh: Mesh):
+def ascent_program(case: AscentCase, mesh: AscentMesh):
     """The nonlinear program as CasADi symbols: unknowns x (6, n) at the intervals' ends, z, u (3, m) and final time.
 
     It minimises the final time, with which the mass left falls, or sum |u_{k+1} - u_k|^2 if the final time is fixed.
@@ -209,7 +209,7 @@ def interpolate(times, t, values):
 
 
 @interruptible()
-def solve_from_guess(case: AscentCase, mesh: Mesh, guess: dict, clock: SolveClock) -> dict:
+def solve_from_guess(case: AscentCase, mesh: AscentMesh, guess: dict, clock: SolveClock) -> dict:
     """Solve `ascent_program` from a guess with t (s), y (states, at least r and v), t_u (s) and u (directions).
 
     Returns the same of the optimum, with y (n+1, 6), and `status`, `final_time` (s), `final_mass` (kg) and `costate`

@@ -46,7 +46,8 @@ class Failing(NamedTuple):
 # ---------------------------------------------------------------------------------------------------------------------
 
 RELAXED_MASS = 0.5  # the last burn may go on down to this part of the dry mass
-MESHES = (1, 2, 0.5)  # factors on a healthy flight's intervals, tried in turn; IPOPT gives up on a few early strikes
+# on a healthy flight's intervals, tried in turn; IPOPT gives up on a few early strikes
+INTERVAL_FACTORS = (1, 2, 0.5)
 
 
 def solve_rescue(job):
@@ -64,10 +65,10 @@ def solve_rescue(job):
         return healthy
     before = draw_vehicles(rocket, failing.dispersion, z[None])
     intervals = guidance.drawn_intervals(rocket, guess["t"][-1])
-    for factor in MESHES:
-        mesh = tuple(max(round(factor * number), 1) for number in intervals)
+    for factor in INTERVAL_FACTORS:
+        scaled = tuple(max(round(factor * number), 1) for number in intervals)
         try:
-            return rescued(rocket, vehicle, before, healthy, orbit, mesh)
+            return rescued(rocket, vehicle, before, healthy, orbit, scaled)
         except NoOptimum:
             continue
     return None

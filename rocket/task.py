@@ -8,11 +8,8 @@ from functools import partial
 import numpy as np
 
 from common.command_line import integer, number
-from common.errors import BadInput, refuse_unless
-from common.tasks import Interface
-from formats.track import Track
-from pages.assemble import Page
-from rocket import export
+from common.errors import refuse_unless
+from common.flying import decision_us
 from rocket.comparison import compare
 from rocket.dispersion import draw_vehicles
 from rocket.environment import flown_mission, fly_rocket
@@ -22,7 +19,6 @@ from rocket.metrics import (
     EQUATORIAL,
     SUCCESS,
     chosen,
-    decision_us,
     draws,
     evaluate_dispersed,
     failure_metrics,
@@ -35,7 +31,6 @@ from rocket.metrics import (
 from rocket.missions import ROCKETS, Mission
 from rocket.navigation import ALLOWED, NOMINAL_FLIGHT, flight_noise, is_noise, noise_metrics
 from rocket.optimum import kept_reference, reached_optimum
-from rocket.page import page as rocket_page
 from rocket.report import report_failures, report_rocket
 from rocket.rescue import Failing, known_optima
 from rocket.table import table
@@ -278,27 +273,6 @@ class RocketTask:
 
     def kept_arrays(self, arrays: dict) -> dict:
         return arrays
-
-    # --- what is taken along
-
-    def interface(self, **env_options) -> Interface:
-        return export.interface(self.mission.rocket, **env_options)
-
-    def step_columns(self, arrays: dict, launch_longitude: float) -> dict:
-        return export.step_columns(self.mission.rocket, arrays, launch_longitude)
-
-    def flight_columns(self, arrays: dict, metrics: dict) -> dict:
-        if "draw" not in arrays:
-            needs = "--flights needs one with --dispersion or --failure"
-            raise BadInput(f"the evaluation of {self.env_id} holds one flight; {needs}")
-        failing = {key: metrics[key] for key in ("failure", "failure_time") if key in metrics}
-        return export.flight_columns(self.mission.rocket, arrays, metrics.get("dispersion", 0.0), **failing)
-
-    def track(self, arrays: dict) -> Track:
-        return export.earth_track(self.env_id, self.mission.rocket, arrays)
-
-    def page(self, metrics: dict, arrays: dict, checkpoint: dict, launch_longitude: float) -> Page:
-        return rocket_page(self.env_id, self.mission, metrics, arrays, checkpoint, launch_longitude)
 
     # --- commands
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from gymnasium.spaces import Box
 
-import baselines  # noqa: F401 - makes every id known
 import envs
 import evaluate
 import ppo_gtrxl_vdp as script

@@ -13,16 +13,17 @@ import pytest
 import spiceypy
 
 import baselines
-import batched.export
 import envs
 import evaluate
+from batched.task import BatchedTask
 from common.errors import BadInput
 from common.tasks import task_of
-from formats import extras
-from formats.columns import csv_bytes
+from exports import extras
+from exports.columns import csv_bytes
+from exports.offers import offer
 from landing.metrics import draws, flight_arrays, fly_draws
 from phased.problem import flights_of_seed
-from rocket.export import earth_track
+from rocket.task import RocketTask
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "results"
@@ -82,7 +83,7 @@ def options_of(env_id):
 def test_every_number_of_a_policy_has_a_name_and_a_unit(env_id):
     for options in options_of(env_id):
         batch = gym.make_vec(env_id, num_envs=1, **options)
-        interface = task_of(env_id).interface(**options)
+        interface = offer(task_of(env_id), "interface")(**options)
         for named, space in (
             (interface.observation, batch.single_observation_space),
             (interface.action, batch.single_action_space),
@@ -96,7 +97,8 @@ def test_a_rockets_names_are_those_of_its_observation():
     batch = gym.make_vec("RocketAscent-v0", num_envs=1, observe_draw=True, dispersion=1.0)
     z = np.arange(batch.draw.size, dtype=float)[None] / 10
     obs, _ = batch.reset(options={"draw": z})
-    names = [name for name, _ in task_of("RocketAscent-v0").interface(observe_draw=True, dispersion=1.0).observation]
+    interface = offer(task_of("RocketAscent-v0"), "interface")(observe_draw=True, dispersion=1.0)
+    names = [name for name, _ in interface.observation]
     seen = dict(zip(names, obs[0]))
     assert (seen["x"], seen["vy"]) == (batch.y[0, 0], batch.y[4, 0])
     assert (seen["time_left"], seen["phase"]) == (1.0, 0.0)
@@ -106,7 +108,7 @@ def test_a_rockets_names_are_those_of_its_observation():
 def test_the_frame_of_an_action_is_the_environments():
     """The note's n and formulas give the direction that the environment flies."""
     batch = gym.make_vec("RocketAscentCutoff-v0", num_envs=1, action_frame="local")
-    note = task_of("RocketAscentCutoff-v0").interface(action_frame="local").notes
+    note = offer(task_of("RocketAscentCutoff-v0"), "interface")(action_frame="local").notes
     n = np.array([float(word) for word in note.split("n = (")[1].split(")")[0].split(",")])
     batch.reset()
     for action in ([1.0, 0.2, -0.1], [0.5, 0.6, 0.3]):
@@ -163,11 +165,11 @@ def test_a_flight_with_an_event_ends_at_its_moment():
     flown = envs.fly(env_id, lambda obs, t: np.full((n, 1), 3.5 if t < 10 else 0.0), x0)
     problem = envs.PROBLEMS[env_id]
     arrays = {"t": problem.dt * np.arange(problem.steps + 1), "cost_reference": flown["cost"], **flown}
-    found = task_of(env_id).step_columns(arrays, 0.0)
+    found = offer(task_of(env_id), "step_columns")(arrays, 0.0)
     last = np.flatnonzero(np.append(np.diff(found["flight"]) > 0, True))
     assert last[0] < problem.steps
     np.testing.assert_allclose(found["t_s"][last], flown["final_time"])
-    ends = task_of(env_id).flight_columns(arrays, {})
+    ends = offer(task_of(env_id), "flight_columns")(arrays, {})
     np.testing.assert_array_equal(ends["x1_end"], found["x1"][last])
     np.testing.assert_array_equal(ends["t_end_s"], flown["final_time"])
 
@@ -217,7 +219,8 @@ def test_a_landers_tables(tmp_path):
     flown = fly_draws("MarsLanding-v0", lambda z: steer, z)
     best = {key: value[:4] for key, value in flown.items()}
     arrays, task = flight_arrays(flown, best), task_of("MarsLanding-v0")
-    steps, flights = task.step_columns(arrays, 0.0), task.flight_columns(arrays, {})
+    steps = offer(task, "step_columns")(arrays, 0.0)
+    flights = offer(task, "flight_columns")(arrays, {})
     last = np.flatnonzero(np.append(np.diff(steps["flight"]) > 0, True))
     np.testing.assert_allclose(steps["t_s"][last], flown["final_time"])
     np.testing.assert_allclose(columns(steps, "x_m", "z_m")[last], flown["final_y"][:, [0, 2]])
@@ -240,7 +243,9 @@ def test_episodes_without_a_table():
     obs[1, 3] = u[1, 2] = np.nan  # the second episode is one step shorter
     reward = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 0.0]])
     arrays = {"t": np.arange(4.0), "obs": obs, "u": u, "reward": reward}
-    steps, flights = batched.export.step_columns(arrays), batched.export.flight_columns(arrays)
+    task = BatchedTask("Mine-v0")
+    steps = offer(task, "step_columns")(arrays, 0.0)
+    flights = offer(task, "flight_columns")(arrays, {})
     assert steps["flight"].tolist() == [0] * 4 + [1] * 3 and steps["obs3"].tolist() == [2, 5, 8, 11, 14, 17, 20]
     assert flights["steps"].tolist() == [3, 2] and flights["return"].tolist() == [6, 9]
 
@@ -372,6 +377,13 @@ def test_a_missing_package_is_named(name, packages, tmp_path, monkeypatch, capsy
 
 
 def test_another_planets_rocket_is_no_track():
-    rocket = SimpleNamespace(mu=4.28e13, body="ground")
+    mission = SimpleNamespace(rocket=SimpleNamespace(mu=4.28e13, body="ground"))
     with pytest.raises(BadInput, match="mu of Mars-v0 is 42800000000000.0; it must be the Earth's"):
-        earth_track("Mars-v0", rocket, {})
+        offer(RocketTask("Mars-v0", mission), "track")({})
+
+
+def test_a_family_without_exports_is_one_line():
+    task = SimpleNamespace(env_id="Mine-v0")  # of a folder that `exports/` does not know
+    for name in ("interface", "step_columns", "flight_columns", "track", "page"):
+        with pytest.raises(BadInput, match="^the env_id is Mine-v0; "):
+            offer(task, name)

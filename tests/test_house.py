@@ -9,7 +9,7 @@ from pathlib import Path
 import gymnasium as gym
 import pytest
 
-import baselines  # noqa: F401 - makes every id known
+import envs
 from common import tasks
 from common.errors import BadInput
 
@@ -91,7 +91,7 @@ def loads(room, seen=None):
 
 LIGHT = {room for room in ROOMS if room.split(".")[0] not in {"drawing", "runs", "cuda_graphs", "sb3_env"}}
 LIGHT -= {room for room in ROOMS if room.startswith("ppo_gtrxl") or room.endswith((".figures", ".animation"))}
-LIGHT -= {"formats.onnx_model"}  # a program of its own
+LIGHT -= {"exports.onnx_model"}  # a program of its own
 
 
 def test_rooms_load_nothing_heavy():
@@ -121,16 +121,6 @@ def test_nothing_asks_which_family_an_id_is_of():
             assert table not in names or head.startswith(readers), (path, table)
 
 
-def test_a_family_that_is_added_again_replaces_itself(monkeypatch):
-    """As when `baselines.py` is both the command and imported by a file of `vehicles/`."""
-    before = list(tasks.FAMILIES)
-    monkeypatch.setattr(tasks, "FAMILIES", before)
-    tables = before[0][0]
-    tasks.add_family(tables, lambda env_id: f"the new task of {env_id}")
-    assert len(tasks.FAMILIES) == len(before) and len(set(tasks.env_ids())) == len(tasks.env_ids())
-    assert tasks.task_of(next(iter(tables))).startswith("the new task")
-
-
 def test_an_id_without_a_task_is_one_line():
     with pytest.raises(BadInput, match="^env_id is 'CartPole-v1', of no family .* one of [^\\n]*VanDerPol-v0"):
         tasks.task_of("CartPole-v1")
@@ -144,3 +134,33 @@ def test_a_process_that_knows_only_the_spec_makes_the_environment(env_id):
     code += "print(gym.make(spec).reset(seed=0)[0].shape)"
     result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert result.returncode == 0 and result.stdout.startswith("("), result.stderr
+
+
+# --- a script loads what it needs -------------------------------------------------------------------------------------
+
+
+def loaded_by(code):
+    """The names of the modules that a new process has loaded after this code."""
+    command = [sys.executable, "-c", f"import sys\n{code}\nprint(*sys.modules)"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    return set(done.stdout.split())
+
+
+def test_the_double_integrators_script_loads_no_other_familys_environment():
+    """Nor an optimum, an exporter or a figure; and with its task still nothing of rockets and landers but tables."""
+    script = loaded_by("import ppo_gtrxl_di")
+    ours = {name for name in script if name in ROOMS}
+    assert not {name for name in ours if name.endswith(("optimum", "export", "task", "figures", "environment"))}
+    assert not ours & {"baselines", "evaluate", "rocket.kalman", "matplotlib"}
+    task = loaded_by("import ppo_gtrxl_di\nfrom common.tasks import task_of\ntask_of('DoubleIntegrator-v0')")
+    assert {name for name in task if name.startswith("rocket.")} == {"rocket.missions", "rocket.vehicle"}
+    assert {name for name in task if name.startswith("landing.")} == {"landing.lander"}
+
+
+def test_every_name_of_envs_can_be_imported():
+    assert [name for name in envs.__all__ if not hasattr(envs, name)] == []
+
+
+def test_a_name_that_envs_lacks_is_an_error():
+    with pytest.raises(AttributeError, match="^module 'envs' has no attribute 'fly_roket'$"):
+        _ = envs.fly_roket

@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 import envs
 from common.errors import BadInput
 from landing.environment import PERIOD, fly_lander, limited
-from landing.lander import DRAW, MARS, POWERED_DESCENT, flights
+from landing.lander import DRAW, MARS, POWERED_DESCENT, draw_flights
 from landing.rewards import has_landed, slope_reward
 
 ID = "MarsLanding-v0"
@@ -78,10 +78,10 @@ def test_thrust_is_clipped_and_zero_points_up():
 
 def test_a_failure_divides_one_lateral_axis_and_the_vertical_one():
     draw = np.array([[*MIDDLE[0, :10], 0.2, axis, 0.25] for axis in (0.1, 0.9)])
-    flown = flights(MARS, draw, 0.5, 2.5, "random")
+    flown = draw_flights(MARS, draw, 0.5, 2.5, "random")
     assert flown.failed.T == pytest.approx(np.array([[0.4, 1.0, 1 / 1.5], [1.0, 0.4, 1 / 1.5]]))
     assert flown.strike == pytest.approx([10.0, 10.0])
-    healthy = flights(MARS, draw, 0.2, 2.5, "random")
+    healthy = draw_flights(MARS, draw, 0.2, 2.5, "random")
     assert (healthy.failed == 1).all() and np.isinf(healthy.strike).all()
 
 

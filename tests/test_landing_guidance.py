@@ -7,7 +7,7 @@ from common.errors import NoOptimum
 from envs import MARS, fly_lander
 from landing import guidance
 from landing.guidance import Estimate, Replanned, drdv_estimated, energy_optimal_acceleration
-from landing.lander import DRAW, flights
+from landing.lander import DRAW, draw_flights
 from landing.optimum import energy_optimal_time, references
 
 pytestmark = pytest.mark.slow
@@ -24,7 +24,7 @@ def rows(n, seed=0):
 def drawn(draw, **options):
     """The hidden numbers of draws, with the environment's defaults."""
     failure = {"failure_probability": 0.5, "failure_size": 2.5, "failure_time": "start"} | options
-    return flights(MARS, draw, *failure.values())
+    return draw_flights(MARS, draw, *failure.values())
 
 
 def soft(flown):

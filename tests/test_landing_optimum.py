@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 from common.errors import BadInput, NoOptimum
 from envs import MARS, POWERED_DESCENT, fly_lander
 from landing import optimum
-from landing.lander import DRAW, flights
+from landing.lander import DRAW, draw_flights
 from landing.optimum import optimise_landing, references
 
 pytestmark = pytest.mark.slow
@@ -35,7 +35,7 @@ def played(u):
 @pytest.fixture(scope="module")
 def descent():
     """Its one flight, solved by glide slope."""
-    flight = flights(POWERED_DESCENT, np.full((1, len(DRAW)), 0.5), 0.0, 2.5, "start")
+    flight = draw_flights(POWERED_DESCENT, np.full((1, len(DRAW)), 0.5), 0.0, 2.5, "start")
     return {slope: optimise_landing(POWERED_DESCENT, flight, 0, slope) for slope in (None, 0.0, 4.0)}
 
 
@@ -134,7 +134,7 @@ def test_knowing_when_a_failure_strikes(mars):
 
 
 def test_the_guess_does_not_matter(monkeypatch):
-    drawn = flights(MARS, rows(3, seed=5), 0.7, 2.5, "random")
+    drawn = draw_flights(MARS, rows(3, seed=5), 0.7, 2.5, "random")
     found = []
     for share in (0.8, 1.3):
         monkeypatch.setattr(optimum, "DURATIONS", (share,))
@@ -159,16 +159,16 @@ def test_processes_change_only_the_time(mars):
 def test_an_optimum_that_is_not_there_is_one_line():
     weak = replace(MARS, greatest_thrust=7000.0)  # 3.5 m/s^2
     with pytest.raises(NoOptimum, match="^landing: IPOPT stopped with [^\n]*$"):
-        optimise_landing(weak, flights(weak, rows(1), 0.0, 2.5, "start"), 0)
+        optimise_landing(weak, draw_flights(weak, rows(1), 0.0, 2.5, "start"), 0)
     brief = replace(MARS, longest=10.0)
     with pytest.raises(NoOptimum, match="^landing: it takes [^\n]* longer than a flight, 10 s$"):
-        optimise_landing(brief, flights(brief, rows(1), 0.0, 2.5, "start"), 0)
+        optimise_landing(brief, draw_flights(brief, rows(1), 0.0, 2.5, "start"), 0)
 
 
 def test_a_solution_that_does_not_land_is_refused(monkeypatch):
     monkeypatch.setattr(optimum, "TOUCHDOWN", np.array([0.0, 0.0, -1e-7, 0.0, 0.0, -0.5]))
     with pytest.raises(NoOptimum, match="^landing: the replay of a solution of [^\n]* m from the pad with 0.5 m/s$"):
-        optimise_landing(MARS, flights(MARS, rows(1), 0.0, 2.5, "start"), 0)
+        optimise_landing(MARS, draw_flights(MARS, rows(1), 0.0, 2.5, "start"), 0)
 
 
 def test_an_unknown_option_is_refused():

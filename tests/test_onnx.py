@@ -25,7 +25,8 @@ from benchmarks.decision import OnnxPolicy, compare  # noqa: E402
 from benchmarks.policies import load  # noqa: E402
 from common.errors import BadInput  # noqa: E402
 from common.tasks import task_of  # noqa: E402
-from formats import onnx_model  # noqa: E402
+from exports import onnx_model  # noqa: E402
+from exports.offers import offer  # noqa: E402
 from rocket.environment import fly_rocket  # noqa: E402
 
 ROOT = Path(__file__).parents[1]
@@ -160,5 +161,5 @@ def test_a_damaged_policy_is_one_line(tmp_path):
 
 
 def test_tasks_have_the_interface_that_the_model_names():
-    interface = task_of("MarsLanding-v0").interface(observe_command=False)
+    interface = offer(task_of("MarsLanding-v0"), "interface")(observe_command=False)
     assert "give 0: thrust_x_before, thrust_y_before, thrust_z_before" in interface.notes

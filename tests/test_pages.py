@@ -32,12 +32,13 @@ from common.errors import BadInput  # noqa: E402
 from common.evaluations import read_evaluation  # noqa: E402
 from common.tasks import task_of  # noqa: E402
 from envs import ROCKET, ROCKETS, Burn, draw_names, fly, fly_rocket  # noqa: E402
-from pages import assemble  # noqa: E402
+from exports import page, rocket_page  # noqa: E402
+from exports.offers import offer  # noqa: E402
+from exports.rocket_page import constants, sliders  # noqa: E402
 from phased.problem import PROBLEMS  # noqa: E402
 from rocket import guidance  # noqa: E402
 from rocket.dispersion import DISPERSION, draw_sigmas  # noqa: E402
-from rocket.page import constants, sliders  # noqa: E402
-from rocket.page import page as rocket_page  # noqa: E402
+from rocket.task import RocketTask  # noqa: E402
 from rocket.vehicle import BOOSTER, STAGE_1, STAGE_2  # noqa: E402
 
 ROOT = Path(__file__).parents[1]
@@ -195,7 +196,7 @@ def test_random_policies_of_rockets(changes, tmp_path):
     )
     metrics, arrays = read_evaluation(ROOT / "results" / result)
     checkpoint = read_checkpoint(tmp_path / "agent.safetensors", {})
-    engine = Engine(assemble.html_bytes(task_of(args.env_id).page(metrics, arrays, checkpoint, 0.0)).decode())
+    engine = Engine(page.html_bytes(offer(task_of(args.env_id), "page")(metrics, arrays, checkpoint, 0.0)).decode())
     flight = engine(f"flyAll(data, {json.dumps(CHANGES)}).policy")
     z, dispersed = draw_of(ROCKETS[args.env_id].rocket, CHANGES), {**options, "dispersion": 1.0}
     flown = fly_rocket(args.env_id, copy.deepcopy(agent).double().make_policy(600), draw=z, **dispersed)
@@ -273,7 +274,8 @@ def test_random_policies_of_small_problems(script, changes, tmp_path):
     x0 = np.random.default_rng(0).uniform(-1, 1, (2, 2))
     flown = fly(args.env_id, copy.deepcopy(agent).double().make_policy(200), x0, **options)
     checkpoint = read_checkpoint(tmp_path / "agent.safetensors", {})
-    engine = Engine(assemble.html_bytes(task_of(args.env_id).page({}, {"x": flown["x"]}, checkpoint, 0.0)).decode())
+    made = offer(task_of(args.env_id), "page")({}, {"x": flown["x"]}, checkpoint, 0.0)
+    engine = Engine(page.html_bytes(made).decode())
     flights = engine("data.starts.map(x => flyPlane(data.problem, x, planePolicy(data.policy, data.problem)))")
     for k, flight in enumerate(flights):
         np.testing.assert_allclose(flight["x"], flown["x"][k], rtol=1e-9, atol=1e-9)
@@ -293,7 +295,7 @@ def test_arrays_arrive_as_they_are():
     single = exact.astype(np.float32)
     short = (single.view(np.uint32) & 0xFFFF0000).view(np.float32)
     written = {"exact": exact, "single": single, "short": short, "one": np.float32([0.1])}
-    data = json.dumps({"of": [written], "count": np.int64(3)}, default=assemble.encoded)
+    data = json.dumps({"of": [written], "count": np.int64(3)}, default=page.encoded)
     assert [json.loads(data)["of"][0][name]["dtype"] for name in written] == [
         "float64",
         "float32",
@@ -337,14 +339,14 @@ def test_the_command(tmp_path):
 @pytest.mark.parametrize("env_id", ["MarsLanding-v0", "Goddard-v0"])
 def test_what_has_no_page_is_one_line(env_id):
     with pytest.raises(BadInput) as refusal:
-        task_of(env_id).page({}, {}, {}, 0.0)
+        offer(task_of(env_id), "page")({}, {}, {}, 0.0)
     assert "\n" not in str(refusal.value) and env_id in str(refusal.value)
 
 
 def test_a_table_with_more_than_a_page_flies_is_one_line(new_problem):
     table = replace(PROBLEMS["VanDerPol-v0"], env_id="Bounded-v0", bounds=((-9.0, 9.0), None), bound_price=1.0)
     with pytest.raises(BadInput, match="^the table is Bounded-v0; it has more than a page can fly"):
-        task_of(new_problem(table)).page({}, {}, {"args": {}}, 0.0)
+        offer(task_of(new_problem(table)), "page")({}, {}, {"args": {}}, 0.0)
 
 
 def test_a_policy_with_other_features_is_one_line(tmp_path):
@@ -352,13 +354,13 @@ def test_a_policy_with_other_features_is_one_line(tmp_path):
     checkpoint = read_checkpoint(tmp_path / "agent.safetensors", {})
     checkpoint["tensors"]["encoder.0.weight"] = np.zeros((8, 5), dtype=np.float32)
     with pytest.raises(BadInput, match="^the policy's number of features is 5; it must be 3 to fly in a page"):
-        task_of("DoubleIntegrator-v0").page({}, {"x": np.zeros((1, 2, 2))}, checkpoint, 0.0)
+        offer(task_of("DoubleIntegrator-v0"), "page")({}, {"x": np.zeros((1, 2, 2))}, checkpoint, 0.0)
 
 
 def test_a_rocket_by_the_tables_isp_is_one_line():
     mission = replace(ROCKETS["RocketAscentCutoff-v0"], rocket=replace(ROCKET, table_isp=True))
     with pytest.raises(BadInput, match="^table_isp of Mine-v0 is True; it must be False for a page"):
-        rocket_page("Mine-v0", mission, {}, {}, {}, 0.0)
+        rocket_page.page(RocketTask("Mine-v0", mission), {}, {}, {}, 0.0)
 
 
 def test_a_page_that_fails_leaves_the_old_one(tmp_path):

@@ -34,6 +34,7 @@ from envs import Rocket, RocketVectorEnv, fly_rocket
 
 REGISTERED, IDS = [FIXED, CUTOFF, LEO], [FIXED, CUTOFF, LEO_FIXED, LEO]
 KEYS = {
+    "final_y",
     *PARTS, "error", "error_norm", "a_km", "e", "i_deg", "raan_deg", "argp_deg", "final_mass_kg", "final_time_s",
     "max_altitude_km", "episodic_return", "points", "crashed",
 }  # fmt: skip

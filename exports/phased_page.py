@@ -5,18 +5,20 @@ from __future__ import annotations
 import numpy as np
 
 from common.errors import refuse_unless
-from pages.assemble import Page, network
+from exports.page import Page, network
 from phased.environment import TRANSITION_STEPS
 from phased.problem import Phase, Problem
+from phased.task import PhasedTask
 
 DYNAMICS = ("double_integrator", "van_der_pol")  # functions of envs.py that pages/plane_physics.js has, too
 
 
-def page(problem: Problem, arrays: dict, checkpoint: dict) -> Page:
+def page(task: PhasedTask, metrics: dict, arrays: dict, checkpoint: dict, launch_longitude: float) -> Page:
     """The page of a policy: the phase plane, in which its start is dragged.
 
     Raises BadInput if the problem is not written in JavaScript, or if the policy has other features.
     """
+    problem = task.problem
     f = problem.f
     known = f.__module__ == "envs" and f.__name__ in DYNAMICS
     allowed = f"must be one of envs.py's {', '.join(DYNAMICS)}, which are written in JavaScript, too"

@@ -1,6 +1,6 @@
-"""One step of a trained policy as an ONNX model, a program of its own; `formats.policy` runs it.
+"""One step of a trained policy as an ONNX model, a program of its own; `exports.policy` runs it.
 
-    python -m formats.onnx_model ppo_gtrxl_rocket results/rocket_cutoff/agent.safetensors policy.onnx
+    python -m exports.onnx_model ppo_gtrxl_rocket results/rocket_cutoff/agent.safetensors policy.onnx
 
 The script is loaded by its file's name. Its `features`, its agent and its weights are written to the model. Only one
 formula is written down again here: the attention of one step, with the memory as an input and an output.
@@ -29,6 +29,7 @@ from common.errors import BadInput
 from common.evaluations import sha256_of
 from common.files import write_bytes
 from common.tasks import task_of
+from exports.offers import offer
 
 
 class PolicyStep(nn.Module):
@@ -166,7 +167,7 @@ def export(script, checkpoint) -> Any:
         verbose=False,
     )
     assert program is not None
-    interface = task_of(args.env_id).interface(**options)
+    interface = offer(task_of(args.env_id), "interface")(**options)
     metadata = {
         "env_id": args.env_id,
         "checkpoint_sha256": sha256_of(checkpoint),

@@ -1,4 +1,4 @@
-"""A policy as an ONNX model. `formats.onnx_model` makes it in its own process, because this module imports no torch."""
+"""A policy as an ONNX model. `exports.onnx_model` makes it in its own process, because this module imports no torch."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import tempfile
 from pathlib import Path
 
 from common.policies import ROOT, run_quietly, script_of
-from formats.extras import need
+from exports.extras import need
 
 
 def onnx_bytes(checkpoint: Path) -> bytes:
@@ -16,6 +16,6 @@ def onnx_bytes(checkpoint: Path) -> bytes:
     script = script_of(checkpoint)
     with tempfile.TemporaryDirectory() as folder:
         target = Path(folder) / "policy.onnx"
-        command = [sys.executable, "-m", "formats.onnx_model", script.stem, str(checkpoint.resolve()), str(target)]
+        command = [sys.executable, "-m", "exports.onnx_model", script.stem, str(checkpoint.resolve()), str(target)]
         run_quietly(command, checkpoint, cwd=ROOT)
         return target.read_bytes()

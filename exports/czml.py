@@ -11,7 +11,7 @@ from datetime import datetime, timedelta
 
 import numpy as np
 
-from formats.track import Track, over_ground
+from exports.track import Track, over_ground
 
 SPEED_UP = 20  # seconds of the flight in a second of the screen
 GREEN, WHITE = [57, 211, 83, 255], [255, 255, 255, 255]

@@ -1,12 +1,16 @@
-"""A small problem's policy and flights for other tools: names of a policy's numbers, columns of tables."""
+"""Of a small problem: names of a policy's numbers, columns of its flights, its page."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from common.tasks import Interface
-from formats.columns import held, named, numbered, stacked
+from exports.columns import held, named, numbered, stacked
+from exports.offers import Interface
+from exports.phased_page import page
 from phased.problem import Problem
+from phased.task import PhasedTask
+
+__all__ = ["flight_columns", "interface", "page", "step_columns"]  # what this family offers
 
 
 def state_names(problem: Problem) -> list[str]:
@@ -20,7 +24,7 @@ def control_names(problem: Problem) -> list[str]:
 
 
 def interface(
-    problem: Problem,
+    task: PhasedTask,
     observe_phase: bool = True,
     observe_velocity: bool = True,
     observe_draw: bool = False,
@@ -28,6 +32,7 @@ def interface(
     scaled_action: bool = False,
 ) -> Interface:
     """What a policy observes and commands, with these options of the environment."""
+    problem = task.problem
     states = state_names(problem)
     controls = control_names(problem)
     clocks = ["tau", "phi"] if problem.waypoints else ["tau"]
@@ -57,8 +62,9 @@ def interface(
     return Interface([(name, "1") for name in seen], [(name, "1") for name in controls], notes)
 
 
-def step_columns(problem: Problem, arrays: dict) -> dict[str, np.ndarray]:
+def step_columns(task: PhasedTask, arrays: dict, launch_longitude: float) -> dict[str, np.ndarray]:
     """The columns of all flights, a row for each state: time (s), state, and the control from there on."""
+    problem = task.problem
     x = arrays["x"]
     u = arrays["u"].reshape(*arrays["u"].shape[:2], problem.controls)
     times = np.tile(arrays["t"], (len(x), 1))
@@ -69,8 +75,9 @@ def step_columns(problem: Problem, arrays: dict) -> dict[str, np.ndarray]:
     return stacked(columns, lives)
 
 
-def flight_columns(problem: Problem, arrays: dict) -> dict[str, np.ndarray]:
+def flight_columns(task: PhasedTask, arrays: dict, metrics: dict) -> dict[str, np.ndarray]:
     """The columns with a row for each flight: start, end, cost, and the optimum's cost from the same start."""
+    problem = task.problem
     x = arrays["x"]
     last = np.isfinite(x).all(axis=2).sum(axis=1) - 1
     names = state_names(problem)

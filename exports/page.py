@@ -1,6 +1,6 @@
-"""One self-contained HTML file of a family's `Page`, with template, style, scripts and data in it.
+"""One self-contained HTML file of a `Page`, with template, style, scripts and data in it.
 
-The scripts are plain JavaScript files of this folder. They are read in the order of `KINDS` into one global scope.
+The scripts are plain JavaScript files of `pages/`. They are read in the order of `KINDS` into one global scope.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 
 from common.errors import refuse_unless
 
-HERE = Path(__file__).parent
+PARTS = Path(__file__).parents[1] / "pages"
 KINDS = {
     "ascent": ["numbers.js", "policy.js", "rocket_physics.js", "rocket_laws.js"]
     + ["vendor/three.min.js", "vendor/coastlines.js", "chart.js", "scene.js", "ascent.js"],
@@ -36,11 +36,11 @@ def html_bytes(page: Page) -> bytes:
     """The file."""
     values = {
         "title": html.escape(page.title),
-        "style": (HERE / "page.css").read_text(),
+        "style": (PARTS / "page.css").read_text(),
         "data": json.dumps(page.data, default=encoded, allow_nan=False).replace("<", "\\u003c"),
         "scripts": "\n".join(script(name) for name in KINDS[page.kind]),
     }
-    text = (HERE / f"{page.kind}.html").read_text()
+    text = (PARTS / f"{page.kind}.html").read_text()
     for name, value in values.items():
         text = text.replace(f"{{{{{name}}}}}", value)
     return text.encode()
@@ -48,7 +48,7 @@ def html_bytes(page: Page) -> bytes:
 
 def script(name: str) -> str:
     """A script as an element of the page, with the license of a library before it."""
-    path = HERE / name
+    path = PARTS / name
     license_path = path.with_name(f"{path.name.split('.')[0]}.LICENSE")
     terms = f"/*\n{license_path.read_text()}*/\n" if license_path.exists() else ""
     return f'<script data-file="{name}">\n{terms}{path.read_text()}</script>'

@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from common.errors import refuse_unless
-from pages.assemble import Page, network
+from exports.page import Page, network
 from rocket.dispersion import (
     DISPERSION,
     WIND_ALTITUDE,
@@ -24,6 +24,7 @@ from rocket.guidance import tracked
 from rocket.missions import Mission
 from rocket.orbits import target_axes, target_orbit
 from rocket.policy_constants import DIFFERENCES
+from rocket.task import RocketTask
 from rocket.vehicle import EngineGroup, Rocket, engine_groups
 
 OPTIONS = {"observe_phase": True, "observe_draw": False, "observe_mass": False}  # a policy is trained with these
@@ -31,11 +32,13 @@ SLIDER_SIGMAS = 6  # how far a slider goes, in standard deviations of a draw
 SEEN = 8 + 3 + 2 + 12  # number of `features` of the script, without those of the phase, the draw and the differences
 
 
-def page(env_id: str, mission: Mission, metrics: dict, arrays: dict, checkpoint: dict, launch_longitude: float) -> Page:
+def page(task: RocketTask, metrics: dict, arrays: dict, checkpoint: dict, launch_longitude: float) -> Page:
     """The page of a policy: the nominal flight beside the optimum, and what the browser needs to fly both anew.
 
     Raises BadInput if no vehicle can be drawn of the table, or if the policy has other features.
     """
+    env_id = task.env_id
+    mission = task.mission
     rocket = mission.rocket
     allowed = "must be False for a page: its stages keep what a vehicle of the page would drop"
     refuse_unless(not rocket.table_isp, f"table_isp of {env_id}", rocket.table_isp, allowed)

@@ -1,12 +1,12 @@
-"""A lander's policy and flights for other tools: names and units of a policy's numbers, columns of tables."""
+"""Of a lander: names and units of a policy's numbers, columns of its flights."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from common.tasks import Interface
-from formats.columns import held, named, stacked
-from landing.lander import Lander
+from exports.columns import held, named, stacked
+from exports.offers import Interface
+from landing.task import LanderTask
 
 POSITION = ("x_m", "y_m", "z_m")
 VELOCITY = ("vx_m_s", "vy_m_s", "vz_m_s")
@@ -17,7 +17,7 @@ EFFECTIVENESS = ("effectiveness_x", "effectiveness_y", "effectiveness_z")
 
 
 def interface(
-    lander: Lander,
+    task: LanderTask,
     observe_phase: bool = True,
     observe_velocity: bool = True,
     observe_command: bool = True,
@@ -25,6 +25,7 @@ def interface(
     **options,
 ) -> Interface:
     """What a policy observes and commands, with these options of the environment."""
+    lander = task.lander
     commands = ["thrust_x", "thrust_y", "thrust_z"]
     before = [f"{name}_before" for name in commands]
     units = [*["m"] * 3, *["m/s"] * 3, "s", *["1"] * 3]
@@ -42,7 +43,7 @@ def interface(
     return Interface(observation, [(name, "1") for name in commands], notes)
 
 
-def step_columns(arrays: dict) -> dict[str, np.ndarray]:
+def step_columns(task: LanderTask, arrays: dict, launch_longitude: float) -> dict[str, np.ndarray]:
     """The columns of all flights, a row for each period: state, command from there on, effectiveness of each axis."""
     y = arrays["y"]
     n, rows = y.shape[:2]
@@ -53,7 +54,7 @@ def step_columns(arrays: dict) -> dict[str, np.ndarray]:
     return stacked(columns, np.isfinite(y).all(axis=2))
 
 
-def flight_columns(arrays: dict) -> dict[str, np.ndarray]:
+def flight_columns(task: LanderTask, arrays: dict, metrics: dict) -> dict[str, np.ndarray]:
     """The columns with a row for each flight: start, gravity, touchdown, propellant, and the optimum's if solved."""
     final = arrays["final_y"]
     n = len(final)

@@ -1,18 +1,22 @@
-"""A rocket's policy and flights for other tools: names and units of a policy's numbers, table columns, the track."""
+"""Of a rocket: names and units of a policy's numbers, columns of its flights, its track, its page."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from common.errors import refuse_unless
-from common.tasks import Interface
-from formats.columns import named
-from formats.track import Track, over_ground
+from common.errors import BadInput, refuse_unless
+from exports.columns import named
+from exports.offers import Interface
+from exports.rocket_page import page
+from exports.track import Track, over_ground
 from rocket.comparison import recorded_flights
 from rocket.dispersion import draw_names
 from rocket.metrics import apsides
 from rocket.orbits import target_axes
+from rocket.task import RocketTask
 from rocket.vehicle import Rocket
+
+__all__ = ["flight_columns", "interface", "page", "step_columns", "track"]  # what this family offers
 
 POSITION = ("x_m", "y_m", "z_m")
 VELOCITY = ("vx_m_s", "vy_m_s", "vz_m_s")
@@ -21,9 +25,10 @@ ACTIONS = {"eci": ("x", "y", "z"), "local": ("up", "along_track", "cross_track")
 
 
 def interface(
-    rocket: Rocket, action_frame: str = "eci", observe_phase: bool = True, observe_draw: bool = False, **options
+    task: RocketTask, action_frame: str = "eci", observe_phase: bool = True, observe_draw: bool = False, **options
 ) -> Interface:
     """What a policy observes and commands, with these options of the environment."""
+    rocket = task.mission.rocket
     units = [*["m"] * 3, *["m/s"] * 3, "kg", "1", "1"]
     observation = list(zip(("x", "y", "z", "vx", "vy", "vz", "mass", "time_left", "phase"), units))
     if observe_draw:
@@ -39,9 +44,9 @@ def interface(
     return Interface(observation, [(name, "1") for name in ACTIONS[action_frame]], notes.strip())
 
 
-def step_columns(rocket: Rocket, arrays: dict, launch_longitude: float) -> dict[str, np.ndarray]:
+def step_columns(task: RocketTask, arrays: dict, launch_longitude: float) -> dict[str, np.ndarray]:
     """The columns of the nominal flight, a row for each step: state, thrust direction from there on, burn from 1."""
-    track = track_of("", rocket, arrays)
+    rocket = task.mission.rocket
     ends = [burn.end for burn in rocket.burns[:-1]]
     direction = np.vstack([arrays["u"], np.full((1, 3), np.nan)])
     return {
@@ -49,17 +54,22 @@ def step_columns(rocket: Rocket, arrays: dict, launch_longitude: float) -> dict[
         **named(STATE, arrays["y"]),
         **named(("thrust_x", "thrust_y", "thrust_z"), direction),
         "burn": 1 + np.searchsorted(ends, arrays["t"], side="right"),
-        **over_ground(track, launch_longitude),
+        **over_ground(track_of("", rocket, arrays), launch_longitude),
     }
 
 
-def flight_columns(rocket: Rocket, arrays: dict, dispersion: float, **failing) -> dict[str, np.ndarray]:
+def flight_columns(task: RocketTask, arrays: dict, metrics: dict) -> dict[str, np.ndarray]:
     """The columns of the flights that differ, a row for each: standard scores, failure, end and orbit.
 
-    `failing` are `failure` and `failure_time`. A flight with a failure has the group of engines that fails, from 1, the
-    moment (s) and the share of thrust lost; a healthy one has zeros.
+    A flight with a failure has the group of engines that fails, from 1, the moment (s) and the share of thrust lost; a
+    healthy one has zeros.
     """
-    flights = recorded_flights(arrays, rocket, dispersion, **failing)
+    if "draw" not in arrays:
+        needs = "--flights needs one with --dispersion or --failure"
+        raise BadInput(f"the evaluation of {task.env_id} holds one flight; {needs}")
+    rocket = task.mission.rocket
+    failing = {key: metrics[key] for key in ("failure", "failure_time") if key in metrics}
+    flights = recorded_flights(arrays, rocket, metrics.get("dispersion", 0.0), **failing)
     scores = draw_names(rocket)
     strikes = {}
     if failing:
@@ -99,7 +109,9 @@ def track_of(name: str, rocket: Rocket, arrays: dict) -> Track:
     return Track(name, arrays["t"], y[:, :3], y[:, 3:6], events, rocket.Re, rocket.omega_e)
 
 
-def earth_track(env_id: str, rocket: Rocket, arrays: dict) -> Track:
+def track(task: RocketTask, arrays: dict) -> Track:
     """The track of a rocket that is launched from the Earth. Raises BadInput for another planet."""
-    refuse_unless(rocket.body == "Earth", f"mu of {env_id}", rocket.mu, "must be the Earth's: OEM and CZML name it")
-    return track_of(env_id, rocket, arrays)
+    rocket = task.mission.rocket
+    allowed = "must be the Earth's: OEM and CZML name it"
+    refuse_unless(rocket.body == "Earth", f"mu of {task.env_id}", rocket.mu, allowed)
+    return track_of(task.env_id, rocket, arrays)

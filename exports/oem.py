@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from formats.extras import need
-from formats.track import Track, turned
+from exports.extras import need
+from exports.track import Track, turned
 
 
 def oem_bytes(track: Track, epoch: datetime, launch_longitude: float) -> bytes:
