@@ -73,14 +73,10 @@ def ring_step(attention, x, ring, t):
     """
     kv, projections = ring
     slots = torch.arange(kv.shape[3], device=x.device)
-    qkv = F.linear(x, projections)  # (N, 3 d)
-    qkv = qkv.view(len(x), 3, attention.num_heads, 1, attention.dk).transpose(0, 1)  # (3, N, H, 1, dk)
-    kv.index_copy_(3, t % len(slots), qkv[1:])
+    q, kv_of_step = attention.project(x, projections)
+    kv.index_copy_(3, t % len(slots), kv_of_step)
     distance = (t - slots) % len(slots)
-    k, v = kv
-    scores = qkv[0] @ (k + attention.R[:, distance]).transpose(-1, -2)  # (N, H, 1, L + 1)
-    attended = scores.softmax(dim=-1) @ v  # (N, H, 1, dk)
-    return attention.out(attended.flatten(1))
+    return attention.attend(q, kv, attention.R[:, distance])
 
 
 def new_rings(cache, L):

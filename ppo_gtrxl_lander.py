@@ -6,9 +6,9 @@
     python ppo_gtrxl_lander.py --eval-only --checkpoint results/mars_landing/agent.safetensors
 
 Reading order: arguments, recipes, problem, Gated Transformer-XL, agent, PPO, what we add to PPO, training, main.
-From the first section "Shared" on, all ppo_gtrxl_*.py are the same to the letter. A section with "ours" in its heading
-contains nothing from the paper. In the other sections a comment marks what is ours. "Line 8" means line 8 of
-Algorithm 1, "Eq. (7)" the seventh numbered equation of the paper.
+From the first section "Shared" on, all ppo_gtrxl_*.py are the same but for lines that end with "# this problem". A
+section with "ours" in its heading contains nothing from the paper. In the other sections a comment marks what is ours.
+"Line 8" means line 8 of Algorithm 1, "Eq. (7)" the seventh numbered equation of the paper.
 
 T is the number of steps, N of environments, H of heads. L is the memory length, d the width, and dk = d / H.
 Algorithm 1 writes E for our N, and N for its iterations.
@@ -19,8 +19,10 @@ The paper names landing and does not fly it. This problem is from Gaudet, Linare
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -30,11 +32,13 @@ from torch.distributions import Normal
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 import runs
+from common import flags
+from common.schedule import Schedule
 from cuda_graphs import speed_up
 from envs import LANDERS
 from landing.environment import PERIOD
+from landing.lander import FAILURE_TIMES
 from landing.rewards import POSITION_SCALE, SPEED_SCALE
-from runs import Schedule, all_reduce_sum
 
 
 @dataclass
@@ -43,16 +47,16 @@ class Args:
 
     --recipe paper uses these values. --recipe ours, the default, first replaces those that RECIPES names. A flag that
     is typed wins over both. A Schedule is one number, or points "place:value place:value ...". Place 0 is the first
-    update, place 1 the last (`value_at`).
+    update, place 1 the last. The types are in common/flags.py: what each flag takes, and whether a policy decides it.
     """
 
     # experiment
     exp_name: str = Path(__file__).stem  # the name of this experiment
-    seed: int = 1  # seed of the experiment
-    recipe: str = "ours"  # what the flags that are not typed are: "paper" (these values) or "ours" (RECIPES first)
+    seed: flags.Natural = 1  # seed of the experiment
+    recipe: flags.Recipe = "ours"  # what the untyped flags are: "paper" (these values) or "ours" (RECIPES first)
     torch_deterministic: bool = True  # if toggled, `torch.backends.cudnn.deterministic=True`
     cuda: bool = True  # if toggled, a GPU is used when there is one
-    num_threads: int = 1  # CPU threads of torch (0: torch's own choice); the bits of the results depend on it
+    num_threads: flags.Threads = 1  # CPU threads of torch (0: torch's own choice); the bits of the results depend on it
     torch_compile: bool = False  # compile the network (on a GPU: CUDA graphs), for a slower start and faster updates
     track: bool = False  # if toggled, this experiment will be tracked with Weights and Biases
     wandb_project_name: str = "ppo-gtrxl"  # the wandb's project name
@@ -62,63 +66,76 @@ class Args:
     checkpoint: str | None = None  # start from these weights (.safetensors)
     resume: str | None = None  # go on with the interrupted run in this run folder, bit for bit
     eval_only: bool = False  # fly the mean action of --checkpoint, train nothing, write only --eval-json and --eval-npz
-    eval_starts: int | None = None  # number of drawn evaluation flights (default 10000; 10 in a training cut short)
-    eval_seed: int = 0  # seed of the evaluation starts
+    eval_starts: flags.Starts | None = None  # number of drawn flights (default 10000; 10 in a training cut short)
+    eval_seed: flags.Natural = 0  # seed of the evaluation starts
     eval_json: str | None = None  # where --eval-only writes the metrics
     eval_npz: str | None = None  # where --eval-only writes the trajectories
-    eval_every: int = 10  # updates between two evaluations, which have their own draws (0: only at the end)
+    eval_every: flags.Natural = 10  # updates between two evaluations, which have their own draws (0: only at the end)
 
     # environment
     env_id: str = "MarsLanding-v0"  # the id of the environment, one of ENV_IDS
-    observe_phase: bool = True  # show the time to the policy
-    observe_velocity: bool = True  # show the velocity to the policy
-    observe_command: bool = True  # show the last command to the policy
-    observe_draw: bool = False  # show mass, gravity and failure to the policy, which no real flight could know
-    failure_probability: float | None = None  # probability of a hidden failure (None: the lander's)
-    failure_size: float | None = None  # a failure divides the thrust along one axis by this (None: the lander's)
-    failure_time: str = "start"  # when a failure strikes: at the "start" or at a "random" moment of the first 40 s
-    decision_s: float = 0.2  # seconds between two commands of the policy, a multiple of 0.2
-    longest_flight: float | None = None  # seconds in which a flight has to land (None: the lander's)
+    observe_phase: flags.Observed = True  # show the time to the policy
+    observe_velocity: flags.Observed = True  # show the velocity to the policy
+    observe_command: flags.Observed = True  # show the last command to the policy
+    observe_draw: flags.Observed = False  # show mass, gravity and failure to the policy, which no real flight knows
+    # probability of a hidden failure (None: the lander's)
+    failure_probability: Annotated[flags.Share | None, flags.Policy.SUGGESTS] = None
+    # a failure divides the thrust along one axis by this (None: the lander's)
+    failure_size: Annotated[float | None, flags.Range(1.0, 100.0), flags.Policy.SUGGESTS] = None
+    # when a failure strikes: at the "start" or at a "random" moment of the first 40 s
+    failure_time: Annotated[str, flags.Words(FAILURE_TIMES), flags.Policy.SUGGESTS] = "start"
+    # seconds between two commands of the policy, a multiple of 0.2
+    decision_s: Annotated[float, flags.Range(0.2, 10.0), flags.Policy.FIXES] = 0.2
+    # seconds in which a flight has to land (None: the lander's)
+    longest_flight: Annotated[float | None, flags.Range(1.0, 1000.0), flags.Policy.FIXES] = None
 
     # Table 1, the column of the rocket
-    num_blocks: int = 6  # number of GTrXL blocks (0: a plain MLP, without memory)
-    embed_dim: int = 384  # embedding dimension d
-    num_heads: int = 8  # number of attention heads
-    memory_length: int = 256  # memory length L: a step attends to itself and the L steps before it
-    mlp_dim: int = 384  # width of the position-wise MLP
-    hidden_dim: int = 384  # width of the hidden layer of each head
-    gamma: float = 0.99  # the discount factor gamma
-    gae_lambda: Schedule = 0.95  # the lambda for the general advantage estimation
-    total_updates: int = 5000  # number of updates
-    update_epochs: int = 16  # the K epochs to update the policy
-    vf_coef: float = 0.8  # coefficient of the value function
-    learning_rate: Schedule = "0:1e-4 1:5e-6"  # the learning rate of the optimizer
-    ent_coef: Schedule = "0:1e-3 1:1e-4"  # coefficient of the entropy
-    clip_coef: float = 0.12  # the surrogate clipping coefficient
+    num_blocks: flags.Blocks = 6  # number of GTrXL blocks (0: a plain MLP, without memory)
+    embed_dim: flags.Width = 384  # embedding dimension d
+    num_heads: flags.Width = 8  # number of attention heads
+    memory_length: flags.Length = 256  # memory length L: a step attends to itself and the L steps before it
+    mlp_dim: flags.Width = 384  # width of the position-wise MLP
+    hidden_dim: flags.Width = 384  # width of the hidden layer of each head
+    gamma: flags.Share = 0.99  # the discount factor gamma
+    gae_lambda: flags.ShareSchedule = Schedule(0.95)  # the lambda for the general advantage estimation
+    total_updates: flags.Count = 5000  # number of updates
+    update_epochs: flags.Count = 16  # the K epochs to update the policy
+    vf_coef: flags.Weight = 0.8  # coefficient of the value function
+    learning_rate: flags.ShareSchedule = Schedule("0:1e-4 1:5e-6")  # the learning rate of the optimizer
+    ent_coef: flags.WeightSchedule = Schedule("0:1e-3 1:1e-4")  # coefficient of the entropy
+    clip_coef: flags.Share = 0.12  # the surrogate clipping coefficient
 
     # not in Table 1: our choice
-    num_envs: int = 32  # parallel environments, one episode each per update
-    num_minibatches: int = 8  # the number of mini-batches of whole episodes
+    num_envs: flags.Count = 32  # parallel environments, one episode each per update
+    num_minibatches: flags.Count = 8  # the number of mini-batches of whole episodes
     norm_adv: bool = True  # normalise the advantages over an update
-    max_grad_norm: float = 0.5  # the maximum norm for the gradient clipping
-    target_kl: float | None = None  # the KL divergence from which an update takes no further step (None: no limit)
-    log_std: Schedule = -1.4  # log of the std in the action's unit. A number: learned from there; points: not learned
-    memory_noise: Schedule = 0.1  # std of the memory before an episode (Algorithm 1, line 5; the text says "small")
-    reward_scale: float = 0.2  # factor on the rewards in training; losses are logged with it, returns without
+    max_grad_norm: flags.Positive = 0.5  # the maximum norm for the gradient clipping
+    target_kl: flags.Positive | None = None  # the KL divergence at which an update takes no further step (None: never)
+    log_std: flags.LogStd = Schedule(-1.4)  # log of the action's std. A number: learned from there; points: not learned
+    memory_noise: flags.ShareSchedule = Schedule(0.1)  # std of the memory before an episode (Algorithm 1, line 5)
+    reward_scale: flags.Positive = 0.2  # factor on the rewards in training; losses are logged with it, returns without
 
     # ours: off here, or as in evaluations; on in RECIPES
     lr_times_std: bool = False  # the learning rate is --learning-rate times the policy's std
-    flights_per_start: Schedule = 1  # flights of each draw, compared with one another
-    fuel_weight: Schedule = 1.0  # reward lost for 100 kg of propellant in training
-    slope_weight: Schedule = 2.0  # weight of a flat last descent in training (`slope_reward` of landing/rewards.py)
-    training_failure_size: float | None = None  # --failure-size in training (None: the same)
-    failure_emphasis: float = 1.0  # factor on --failure-probability in training
-    failed_fuel_share: float = 1.0  # share of --fuel-weight that flights with a failure pay
-    thrust_share: float = 1.0  # share of the greatest thrust that training may ask for
-    start_spread: float = 1.0  # factor on the width of the starts in training, along x and y
-    wind: Schedule = 0.0  # amplitude (m/s^2) of a sideways acceleration in training that comes and goes
-    action_hold: Schedule = 1.0  # training holds an action for this many times --decision-s
-    weight_average: float = 0.0  # decay, per optimiser step, of the averaged weights used in evaluation
+    flights_per_start: flags.CountSchedule = Schedule(1)  # flights of each draw, compared with one another
+    fuel_weight: flags.WeightSchedule = Schedule(1.0)  # reward lost for 100 kg of propellant in training
+    slope_weight: flags.WeightSchedule = Schedule(2.0)  # weight of a flat last descent in training (`slope_reward`)
+    # --failure-size in training (None: the same)
+    training_failure_size: Annotated[float | None, flags.Range(1.0, 100.0)] = None
+    failure_emphasis: Annotated[float, flags.Range(0.0, 10.0)] = 1.0  # factor on --failure-probability in training
+    failed_fuel_share: flags.Share = 1.0  # share of --fuel-weight that flights with a failure pay
+    # share of the greatest thrust that training may ask for
+    thrust_share: Annotated[float, flags.Range(0.2, 1.0)] = 1.0
+    # factor on the width of the starts in training, along x and y
+    start_spread: Annotated[float, flags.Range(0.0, 2.0)] = 1.0
+    # amplitude (m/s^2) of a sideways acceleration in training that comes and goes
+    wind: Annotated[Schedule, flags.Range(0.0, 10.0)] = Schedule(0.0)
+    # training holds an action for this many times --decision-s
+    action_hold: Annotated[Schedule, flags.Range(1.0, 500.0)] = Schedule(1.0)
+    weight_average: flags.Decay = 0.0  # decay, per optimiser step, of the averaged weights used in evaluation
+
+    def __post_init__(self):
+        flags.parse_schedules(self)
 
 
 # Recipes: the values that we replace (docs/landing.md#how-it-is-trained has the reasons) ------------------------------
@@ -132,7 +149,7 @@ OURS = {
     "total_updates": 280,
     "num_envs": 1536,  # with 1024 flights an update, seed 1 burns more
     "num_minibatches": 48,
-    "flights_per_start": "0:32 0.7:32 0.7001:16",  # more draws late
+    "flights_per_start": "0:32 0.7:32 0.7:16",  # more draws late
     "update_epochs": 4,
     "learning_rate": 3e-3,
     "lr_times_std": True,
@@ -175,9 +192,13 @@ ENV_OPTIONS = (  # arguments of the environments
     "failure_probability", "failure_size", "failure_time", "decision_s", "longest_flight",
 )  # fmt: skip
 FIXED_OPTIONS = {}  # arguments that no flag sets
-BUFFERS = {env_id: {"gravity": lander.gravity} for env_id, lander in LANDERS.items()}  # read as agent.<name>
 INITIAL_ACTION = [0.0, 0.0, 0.4]  # thrust straight up, a little more than the weight
 OBSERVED = 10  # numbers that every lander shows: r, v, time, command; the draw comes after them
+
+
+def constants(env_id):
+    """The buffers of an environment's agents, saved with the weights; `features` reads them as agent.<name>."""
+    return {"gravity": LANDERS[env_id].gravity}
 
 
 def features(agent, obs):
@@ -227,44 +248,36 @@ SLOPE_HEIGHT = 10.0  # m; a descent that is steep from there on has time to beco
 SINK_RATE = 0.8  # m/s; a policy that aims at rest on the ground can come to rest just above it and hover
 
 
-def set_curriculum(envs, args, progress):
-    """Set what only training changes. Returns how many flights in a row have the same draw.
+def curriculum(args, progress):
+    """What this update hands over to the environments, by name (`LanderTraining` of landing/environment.py).
 
     The terminal reward tells errors apart only above its scales. Noise scatters flights in proportion to its std. So
     the scales fall with the noise if --log-std is a schedule, as in our recipe. They never fall below those of
     evaluations. With a learned noise, as in the paper's recipe, the reward is that of evaluations.
     """
-    if isinstance(args.log_std, str):
-        std = math.exp(value_at(args.log_std, progress))
-        envs.position_scale = max(30 * std, POSITION_SCALE)
-        envs.speed_scale = max(10 * std, SPEED_SCALE)
-        envs.aloft_price = ALOFT_PRICE
-        envs.slope_height = SLOPE_HEIGHT
-        envs.sink_rate = SINK_RATE
-    envs.fuel_price = value_at(args.fuel_weight, progress)
-    envs.failed_fuel_share = args.failed_fuel_share
-    envs.slope_price = value_at(args.slope_weight, progress)
     of_lander = LANDERS[args.env_id].failure_probability
     probability = of_lander if args.failure_probability is None else args.failure_probability
-    envs.failure_probability = min(args.failure_emphasis * probability, 1.0)
-    if args.training_failure_size is not None:
-        envs.failure_size = args.training_failure_size
-    envs.thrust_share = args.thrust_share
-    envs.start_spread = args.start_spread
-    envs.wind = value_at(args.wind, progress)
-    hold = value_at(args.action_hold, progress) * args.decision_s / PERIOD
-    envs.decision_s = max(round(hold), 1) * PERIOD
-    group = round(value_at(args.flights_per_start, progress))
-    envs.flights_per_start = group
-    return group
-
-
-def add_rewards(envs, args, progress, batch, episodes):
-    """Does nothing here. Training is paid what the environment pays; the rocket's script adds to it."""
-
-
-def before_training(agent, args, env_options):
-    """Does nothing here. The rocket's script prepares its agent for vehicles that differ."""
+    hold = args.action_hold.at(progress) * args.decision_s / PERIOD
+    training = {
+        "flights_per_start": round(args.flights_per_start.at(progress)),
+        "fuel_price": args.fuel_weight.at(progress),
+        "failed_fuel_share": args.failed_fuel_share,
+        "slope_price": args.slope_weight.at(progress),
+        "failure_probability": min(args.failure_emphasis * probability, 1.0),
+        "failure_size": args.training_failure_size,
+        "thrust_share": args.thrust_share,
+        "start_spread": args.start_spread,
+        "wind": args.wind.at(progress),
+        "decision_s": max(round(hold), 1) * PERIOD,
+    }
+    if args.log_std.has_points:
+        std = math.exp(args.log_std.at(progress))
+        training["position_scale"] = max(30 * std, POSITION_SCALE)
+        training["speed_scale"] = max(10 * std, SPEED_SCALE)
+        training["aloft_price"] = ALOFT_PRICE
+        training["slope_height"] = SLOPE_HEIGHT
+        training["sink_rate"] = SINK_RATE
+    return training
 
 
 # Shared: Gated Transformer-XL ("Gated Transformer-XL Implementation") -------------------------------------------------
@@ -374,11 +387,20 @@ class RelativeAttention(nn.Module):
         """
         kv, projections, R = cache
         L = self.memory_length
+        q, kv_of_step = self.project(x, projections)
+        kv[:, :, :, t + L : t + L + 1] = kv_of_step
+        return self.attend(q, kv[:, :, :, t : t + L + 1], R)
+
+    def project(self, x, projections):
+        """One step's query (N, H, 1, dk), and its key and value (2, N, H, 1, dk), of x (N, d)."""
         qkv = F.linear(x, projections)  # (N, 3 d)
-        qkv = qkv.view(len(x), 3, self.num_heads, 1, self.dk).transpose(0, 1)  # (3, N, H, 1, dk)
-        kv[:, :, :, t + L : t + L + 1] = qkv[1:]
-        k, v = kv[:, :, :, t : t + L + 1]  # (N, H, L + 1, dk)
-        scores = qkv[0] @ (k + R).transpose(-1, -2)  # (N, H, 1, L + 1)
+        qkv = qkv.view(-1, 3, self.num_heads, 1, self.dk).transpose(0, 1)  # (3, N, H, 1, dk)
+        return qkv[0], qkv[1:]
+
+    def attend(self, q, window, R):
+        """MultiHead(x) (N, d) of one step, from its query and the window's keys and values (2, N, H, L + 1, dk)."""
+        k, v = window  # (N, H, L + 1, dk)
+        scores = q @ (k + R).transpose(-1, -2)  # (N, H, 1, L + 1)
         attended = scores.softmax(dim=-1) @ v  # (N, H, 1, dk)
         return self.out(attended.flatten(1))
 
@@ -423,9 +445,9 @@ class Agent(nn.Module):
         self.memory_length = args.memory_length
         self.embed_dim = d
 
-        # buffers of the problem, saved with the weights; `features` and `mean_action` read them as agent.<name>
-        constants = {**BUFFERS[args.env_id], "action_scale": envs.single_action_space.high.tolist()}
-        for name, value in constants.items():
+        # saved with the weights; `features` and `mean_action` read them as agent.<name>
+        buffers = {**constants(args.env_id), "action_scale": envs.single_action_space.high.tolist()}
+        for name, value in buffers.items():
             self.register_buffer(name, torch.tensor(value))
         any_observation = torch.ones(envs.single_observation_space.shape)  # only the number of its features is used
         inputs = len(features(self, any_observation))
@@ -436,8 +458,8 @@ class Agent(nn.Module):
         self.actor = nn.Sequential(linear(d, hidden, gain=2**0.5), nn.GELU(), linear(hidden, actions, gain=0.01))
         self.actor[-1].bias.data[:] = torch.tensor(INITIAL_ACTION)
         self.critic = nn.Sequential(linear(d, hidden, gain=2**0.5), nn.GELU(), linear(hidden, 1))
-        learned = not isinstance(args.log_std, str)  # a number is where learning begins; points are set
-        self.actor_logstd = nn.Parameter(torch.full((actions,), value_at(args.log_std, 0.0)), requires_grad=learned)
+        learned = not args.log_std.has_points  # a number is where learning begins; points are set
+        self.actor_logstd = nn.Parameter(torch.full((actions,), args.log_std.at(0.0)), requires_grad=learned)
 
     def new_memory(self, num_envs, noise):
         """m_0 ~ N(0, noise^2), drawn once per episode and block: (blocks, N, L, d)."""
@@ -524,11 +546,12 @@ class Batch:
 
 
 @torch.no_grad()
-def rollout(agent, envs, reward_scale, memory_noise):
-    """Fly one episode in each environment (lines 3-13).
+def rollout(agent, envs, training, reward_scale, memory_noise):
+    """Fly one episode in each environment (lines 3-13). `training` is what `curriculum` hands over to them.
 
-    Returns this process's Batch, and {key: (episodes, ...)} of `final_info` for the episodes of all processes.
+    Returns the Batch, and {key: (N, ...)}, the `final_info` of its episodes.
     """
+    next_obs, _ = envs.reset(options={"training": training})
     T, N = envs.episode_steps, envs.num_envs
     zeros = agent.actor_logstd.new_zeros  # on the agent's device, in its precision
     batch = Batch(
@@ -546,7 +569,6 @@ def rollout(agent, envs, reward_scale, memory_noise):
     alive_at = np.zeros((T, N))
     alive = np.ones(N, dtype=bool)
     episodes = {}  # `final_info` of each environment's first episode
-    next_obs, _ = envs.reset()
     batch.obs[:] = torch.as_tensor(next_obs)  # no step stays zero: the features of zeros could be NaN
 
     for t in range(T):  # line 6
@@ -568,9 +590,7 @@ def rollout(agent, envs, reward_scale, memory_noise):
     batch.alive[:] = torch.as_tensor(alive_at)
     # v_t of line 8 and log pi(a_t). Sampling needs neither, so one call computes them for all steps.
     batch.logprobs, _, batch.critic = agent.evaluate_actions(hidden, batch.actions)
-    of_each_process = runs.all_gather(episodes)
-    all_episodes = {key: np.concatenate([part[key] for part in of_each_process]) for key in episodes}
-    return batch, all_episodes
+    return batch, episodes
 
 
 def gae(rewards, values, alive, gamma, gae_lambda):
@@ -592,10 +612,10 @@ def gae(rewards, values, alive, gamma, gae_lambda):
 
 
 def moments(x, alive, dim):
-    """Mean and variance of x (T, N, ...) along dim, over the living steps of all processes. dim is kept as 1."""
-    count = all_reduce_sum(alive.sum(dim, keepdim=True)).clamp(min=1)
-    mean = all_reduce_sum((x * alive).sum(dim, keepdim=True)) / count
-    variance = all_reduce_sum(((x - mean) ** 2 * alive).sum(dim, keepdim=True)) / count
+    """Mean and variance of x (T, N, ...) along dim, over the living steps. dim is kept as 1."""
+    count = runs.total(alive.sum(dim, keepdim=True)).clamp(min=1)
+    mean = runs.total((x * alive).sum(dim, keepdim=True)) / count
+    variance = runs.total(((x - mean) ** 2 * alive).sum(dim, keepdim=True)) / count
     return mean, variance
 
 
@@ -610,12 +630,12 @@ def ppo_loss(agent, batch, mb, clip_coef, vf_coef, ent_coef):
     """The loss -L_CLIP + c1 L_VF - c2 H over the living steps of the episodes `mb`, and the means that are logged.
 
     L_CLIP is Eq. (11). Line 18 prints L_CLIP + c1 L_VF - c2 H. Our sign of L_CLIP raises it where the loss is
-    minimised. L_VF is 1/2 (critic - target)^2. Under torchrun the loss is this process's part of the mean, and
-    `ppo_gradient` sums the gradients. What is logged is the mean over all processes.
+    minimised. L_VF is 1/2 (critic - target)^2. With several processes `runs.total` sums over them: the loss is this
+    process's part of the mean, and what is logged is the whole mean.
     """
     alive = batch.alive[:, mb]
     advantages = batch.advantages[:, mb]
-    steps = all_reduce_sum(alive.sum())
+    steps = runs.total(alive.sum())
 
     def mean(x):
         return (x * alive).sum() / steps
@@ -640,8 +660,8 @@ def ppo_loss(agent, batch, mb, clip_coef, vf_coef, ent_coef):
         losses["old_approx_kl"] = mean(-logratio)
         losses["approx_kl"] = mean((ratio - 1) - logratio)
         losses["clipfrac"] = mean(((ratio - 1.0).abs() > clip_coef).to(ratio.dtype))
-    of_all_processes = all_reduce_sum(torch.stack([value.detach() for value in losses.values()]))
-    return loss, dict(zip(losses, of_all_processes))
+    means = runs.total(torch.stack([value.detach() for value in losses.values()]))
+    return loss, dict(zip(losses, means))
 
 
 def ppo_gradient(args, agent, batch, mb, ent_coef):
@@ -652,26 +672,12 @@ def ppo_gradient(args, agent, batch, mb, ent_coef):
     loss, losses = ppo_loss(agent, batch, mb, args.clip_coef, args.vf_coef, ent_coef)
     agent.zero_grad()
     loss.backward()
-    runs.sum_gradients(agent)  # over the processes of torchrun
+    runs.total([weight.grad for weight in agent.parameters() if weight.grad is not None])  # of all processes
     losses["gradient_norm"] = nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
     return losses
 
 
 # Shared, ours: what we add to PPO -------------------------------------------------------------------------------------
-def value_at(schedule, progress):
-    """The value of a schedule at `progress`, which is 0 in the first update and 1 in the last.
-
-    A number is constant. Points "0:-1 0.4:-2 1:-6" are joined by lines. If two points have one place, the second counts
-    from there on.
-    """
-    if not isinstance(schedule, str):
-        return float(schedule)
-    points = [point.split(":") for point in schedule.split()]
-    places = [float(place) for place, _ in points]
-    values = [float(value) for _, value in points]
-    return float(np.interp(progress, places, values))
-
-
 def set_log_std(agent, args, progress):
     """Set the log-std of this update if --log-std is a schedule. Clamp it if it is learned.
 
@@ -680,7 +686,7 @@ def set_log_std(agent, args, progress):
     if agent.actor_logstd.requires_grad:
         agent.actor_logstd.data.clamp_(*LOG_STD_RANGE)
     else:
-        agent.actor_logstd.data.fill_(value_at(args.log_std, progress))
+        agent.actor_logstd.data.fill_(args.log_std.at(progress))
 
 
 def learning_rate_of(agent, args, progress):
@@ -691,7 +697,7 @@ def learning_rate_of(agent, args, progress):
     learning rate is in proportion to the std, a step changes the policy by about the same KL at any noise, and the
     policy still learns when the noise is small.
     """
-    learning_rate = value_at(args.learning_rate, progress)
+    learning_rate = args.learning_rate.at(progress)
     if not args.lr_times_std:
         return learning_rate
     return learning_rate * agent.actor_logstd.exp().mean().item()
@@ -724,6 +730,9 @@ def linear_fit(x, y, alive):
     return fitted[..., 0].to(alive.dtype)
 
 
+SMALLEST_SPREAD = 0.3  # of the mean spread; a step of almost no spread would be divided by almost 0
+
+
 def returns_baseline(batch, gamma, group):
     """The baseline (T, N) and the scale (T, 1) of the value V(s_t) = baseline_t + scale_t * critic(s_t).
 
@@ -732,8 +741,7 @@ def returns_baseline(batch, gamma, group):
 
     Each `group` of neighbouring episodes flew the same start. Their returns from step t on are regressed linearly on
     their observations at step t. The fit is the baseline. Its residuals have a spread at each step, over all flights of
-    all groups. scale^2 is the spread^2 of the step plus (0.3 x the mean spread of the steps)^2. Without the second term
-    a step of almost no spread would be divided by almost 0.
+    all groups. scale^2 is the spread^2 of the step plus (SMALLEST_SPREAD x the mean spread of the steps)^2.
 
     RLOO (Kool et al. 2019) takes the mean return of the other samples of a question as the baseline. GRPO (Shao et al.
     2024) takes the mean return of the whole group, and divides by the group's spread. Both have one return for each
@@ -749,7 +757,7 @@ def returns_baseline(batch, gamma, group):
     baseline = linear_fit(obs, grouped_returns, alive).flatten(1)
     _, variance = moments(monte_carlo - baseline, batch.alive, 1)
     mean_spread = variance.sqrt().mean()  # steps that no flight reaches count as zeros
-    scale = (variance + (0.3 * mean_spread) ** 2 + 1e-8).sqrt()
+    scale = (variance + (SMALLEST_SPREAD * mean_spread) ** 2 + 1e-8).sqrt()
     return baseline, scale
 
 
@@ -771,19 +779,19 @@ def train(args, agent, average, optimizer, envs, run, gradient=ppo_gradient):
     target_kl = math.inf if args.target_kl is None else args.target_kl
     for iteration in range(run.updates_done + 1, args.total_updates + 1):  # line 2
         progress = (iteration - 1) / max(args.total_updates - 1, 1)
-        memory_noise = value_at(args.memory_noise, progress)
-        gae_lambda = value_at(args.gae_lambda, progress)
-        ent_coef = value_at(args.ent_coef, progress)
+        memory_noise = args.memory_noise.at(progress)
+        gae_lambda = args.gae_lambda.at(progress)
+        ent_coef = args.ent_coef.at(progress)
         set_log_std(agent, args, progress)
         learning_rate = learning_rate_of(agent, args, progress)
         optimizer.param_groups[0]["lr"] = learning_rate
-        group = set_curriculum(envs, args, progress)  # ours
+        training = curriculum(args, progress)  # ours
 
         # lines 3-13: fly one episode in every environment
-        batch, episodes = rollout(agent, envs, args.reward_scale, memory_noise)
-        add_rewards(envs, args, progress, batch, episodes)  # ours
+        batch, episodes = rollout(agent, envs, training, args.reward_scale, memory_noise)
 
         # line 14: returns and advantages
+        group = training["flights_per_start"]
         baseline, scale = returns_baseline(batch, args.gamma, group)  # ours; 0 and 1 with group 1
         values = baseline + scale * batch.critic
         advantages, returns = gae(batch.rewards, values, batch.alive, args.gamma, gae_lambda)
@@ -813,13 +821,12 @@ def train(args, agent, average, optimizer, envs, run, gradient=ppo_gradient):
 
 def main(argv):
     """Train and evaluate, or with --eval-only evaluate, by the flags `argv`."""
-    args, saved = runs.parse_args(Args, recipe, argv, ENV_OPTIONS, BUFFERS)
+    args, saved = runs.parse_args(sys.modules[__name__], argv)
     device = runs.prepare_torch(args)
     env_options = {name: getattr(args, name) for name in ENV_OPTIONS} | FIXED_OPTIONS
     envs = runs.make_envs(args, env_options)
     agent = Agent(args, envs).to(device)  # line 1
     runs.load_checkpoint(agent, args, saved)
-    before_training(agent, args, env_options)
     average = AveragedModel(agent, multi_avg_fn=get_ema_multi_avg_fn(args.weight_average))
     optimizer = torch.optim.Adam(agent.parameters(), eps=1e-5, fused=True)  # train sets its learning rate
     run = runs.Run(

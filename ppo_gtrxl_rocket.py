@@ -8,9 +8,9 @@
     python ppo_gtrxl_rocket.py --eval-only --checkpoint results/rocket_fixed/agent.safetensors
 
 Reading order: arguments, recipes, problem, Gated Transformer-XL, agent, PPO, what we add to PPO, training, main.
-From the first section "Shared" on, all ppo_gtrxl_*.py are the same to the letter. A section with "ours" in its heading
-contains nothing from the paper. In the other sections a comment marks what is ours. "Line 8" means line 8 of
-Algorithm 1, "Eq. (7)" the seventh numbered equation of the paper.
+From the first section "Shared" on, all ppo_gtrxl_*.py are the same but for lines that end with "# this problem". A
+section with "ours" in its heading contains nothing from the paper. In the other sections a comment marks what is ours.
+"Line 8" means line 8 of Algorithm 1, "Eq. (7)" the seventh numbered equation of the paper.
 
 T is the number of steps, N of environments, H of heads. L is the memory length, d the width, and dk = d / H.
 Algorithm 1 writes E for our N, and N for its iterations.
@@ -23,9 +23,10 @@ rocket/rewards.py. Here R_trajectory has no weight. R_guidance counts only with 
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -36,12 +37,15 @@ from torch.distributions import Normal
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 import runs
+from common import flags
 from common.flying import fly_until_ended
+from common.schedule import Schedule
 from cuda_graphs import speed_up
 from envs import ROCKETS
+from rocket.failure import FAILURE_TIMES
 from rocket.policy_constants import DIFFERENCES, WIDE_DIFFERENCES, policy_constants
 from rocket.rewards import TERMINAL_SCALE, mass_rewards
-from runs import Numbers, Schedule, all_reduce_sum
+from runs import Numbers
 
 
 @dataclass
@@ -50,16 +54,16 @@ class Args:
 
     --recipe paper uses these values. --recipe ours, the default, first replaces those that RECIPES names. A flag that
     is typed wins over both. A Schedule is one number, or points "place:value place:value ...". Place 0 is the first
-    update, place 1 the last (`value_at`).
+    update, place 1 the last. The types are in common/flags.py: what each flag takes, and whether a policy decides it.
     """
 
     # experiment
     exp_name: str = Path(__file__).stem  # the name of this experiment
-    seed: int = 1  # seed of the experiment
-    recipe: str = "ours"  # what the flags that are not typed are: "paper" (these values) or "ours" (RECIPES first)
+    seed: flags.Natural = 1  # seed of the experiment
+    recipe: flags.Recipe = "ours"  # what the untyped flags are: "paper" (these values) or "ours" (RECIPES first)
     torch_deterministic: bool = True  # if toggled, `torch.backends.cudnn.deterministic=True`
     cuda: bool = True  # if toggled, a GPU is used when there is one
-    num_threads: int = 1  # CPU threads of torch (0: torch's own choice); the bits of the results depend on it
+    num_threads: flags.Threads = 1  # CPU threads of torch (0: torch's own choice); the bits of the results depend on it
     torch_compile: bool = False  # compile the network (on a GPU: CUDA graphs), for a slower start and faster updates
     track: bool = False  # if toggled, this experiment will be tracked with Weights and Biases
     wandb_project_name: str = "ppo-gtrxl"  # the wandb's project name
@@ -69,54 +73,61 @@ class Args:
     checkpoint: str | None = None  # start from these weights (.safetensors)
     resume: str | None = None  # go on with the interrupted run in this run folder, bit for bit
     eval_only: bool = False  # fly the mean action of --checkpoint, train nothing, write only --eval-json and --eval-npz
-    eval_starts: int | None = None  # number of drawn evaluation flights (default 1705; 100 in a training cut short)
-    eval_seed: int = 0  # seed of the evaluation starts
+    eval_starts: flags.Starts | None = None  # number of drawn flights (default 1705; 100 in a training cut short)
+    eval_seed: flags.Natural = 0  # seed of the evaluation starts
     eval_json: str | None = None  # where --eval-only writes the metrics
     eval_npz: str | None = None  # where --eval-only writes the trajectories
-    eval_every: int = 5  # updates between two evaluations, which have their own draws (0: only at the end)
+    eval_every: flags.Natural = 5  # updates between two evaluations, which have their own draws (0: only at the end)
 
     # environment
     env_id: str = "RocketAscent-v0"  # the id of the environment, one of ENV_IDS
-    observe_phase: bool = True  # show time and phase to the policy
-    dispersion: float = 0.0  # spread of the drawn vehicles, as a factor on `envs.Dispersion` (0: all are nominal)
-    observe_draw: bool = False  # show the drawn vehicle to the policy, which no real flight could know
-    observe_mass: bool = False  # show the true mass of a drawn rocket, not the flight computer's estimate
-    failure: float = 0.0  # in half of the flights one group of engines loses up to this share (with cut-off)
-    failure_time: str = "random"  # when thrust is lost: at a "random" moment or at the last stage's "ignition"
+    observe_phase: flags.Observed = True  # show time and phase to the policy
+    # spread of the drawn vehicles, as a factor on `envs.Dispersion` (0: all are nominal)
+    dispersion: Annotated[float, flags.Range(0.0, 10.0)] = 0.0
+    observe_draw: flags.Observed = False  # show the drawn vehicle to the policy, which no real flight could know
+    observe_mass: flags.Observed = False  # show the true mass of a drawn rocket, not the flight computer's estimate
+    # in half of the flights one group of engines loses up to this share (with cut-off)
+    failure: Annotated[float, flags.Range(0.0, 0.3)] = 0.0
+    # when thrust is lost: at a "random" moment or at the last stage's "ignition"
+    failure_time: Annotated[str, flags.Words(FAILURE_TIMES), flags.Policy.SUGGESTS] = "random"
     navigation_noise: Numbers = None  # standard deviations, m and m/s, of the observed position and velocity
 
     # Table 1
-    num_blocks: int = 6  # number of GTrXL blocks (0: a plain MLP, without memory)
-    embed_dim: int = 384  # embedding dimension d
-    num_heads: int = 8  # number of attention heads
-    memory_length: int = 256  # memory length L: a step attends to itself and the L steps before it
-    mlp_dim: int = 384  # width of the position-wise MLP
-    hidden_dim: int = 384  # width of the hidden layer of each head
-    gamma: float = 0.99  # the discount factor gamma
-    gae_lambda: Schedule = 0.95  # the lambda for the general advantage estimation
-    total_updates: int = 5000  # number of updates
-    update_epochs: int = 16  # the K epochs to update the policy
-    vf_coef: float = 0.8  # coefficient of the value function
-    learning_rate: Schedule = "0:1e-4 1:5e-6"  # the learning rate of the optimizer
-    ent_coef: Schedule = "0:1e-3 1:1e-4"  # coefficient of the entropy
-    clip_coef: float = 0.12  # the surrogate clipping coefficient
+    num_blocks: flags.Blocks = 6  # number of GTrXL blocks (0: a plain MLP, without memory)
+    embed_dim: flags.Width = 384  # embedding dimension d
+    num_heads: flags.Width = 8  # number of attention heads
+    memory_length: flags.Length = 256  # memory length L: a step attends to itself and the L steps before it
+    mlp_dim: flags.Width = 384  # width of the position-wise MLP
+    hidden_dim: flags.Width = 384  # width of the hidden layer of each head
+    gamma: flags.Share = 0.99  # the discount factor gamma
+    gae_lambda: flags.ShareSchedule = Schedule(0.95)  # the lambda for the general advantage estimation
+    total_updates: flags.Count = 5000  # number of updates
+    update_epochs: flags.Count = 16  # the K epochs to update the policy
+    vf_coef: flags.Weight = 0.8  # coefficient of the value function
+    learning_rate: flags.ShareSchedule = Schedule("0:1e-4 1:5e-6")  # the learning rate of the optimizer
+    ent_coef: flags.WeightSchedule = Schedule("0:1e-3 1:1e-4")  # coefficient of the entropy
+    clip_coef: flags.Share = 0.12  # the surrogate clipping coefficient
 
     # not in Table 1: our choice
-    num_envs: int = 32  # parallel environments, one episode each per update
-    num_minibatches: int = 8  # the number of mini-batches of whole episodes
+    num_envs: flags.Count = 32  # parallel environments, one episode each per update
+    num_minibatches: flags.Count = 8  # the number of mini-batches of whole episodes
     norm_adv: bool = True  # normalise the advantages over an update
-    max_grad_norm: float = 0.5  # the maximum norm for the gradient clipping
-    target_kl: float | None = None  # the KL divergence from which an update takes no further step (None: no limit)
-    log_std: Schedule = -1.4  # log of the std in the action's unit. A number: learned from there; points: not learned
-    memory_noise: Schedule = 0.1  # std of the memory before an episode (Algorithm 1, line 5; the text says "small")
-    reward_scale: float = 0.2  # factor on the rewards in training; losses are logged with it, returns without
+    max_grad_norm: flags.Positive = 0.5  # the maximum norm for the gradient clipping
+    target_kl: flags.Positive | None = None  # the KL divergence at which an update takes no further step (None: never)
+    log_std: flags.LogStd = Schedule(-1.4)  # log of the action's std. A number: learned from there; points: not learned
+    memory_noise: flags.ShareSchedule = Schedule(0.1)  # std of the memory before an episode (Algorithm 1, line 5)
+    reward_scale: flags.Positive = 0.2  # factor on the rewards in training; losses are logged with it, returns without
 
     # ours: off here, on in RECIPES
     lr_times_std: bool = False  # the learning rate is --learning-rate times the policy's std
-    flights_per_start: Schedule = 1  # flights of each start or draw, compared with one another
+    flights_per_start: flags.CountSchedule = Schedule(1)  # flights of each start or draw, compared with one another
     guidance: bool = False  # pay R_guidance, which the paper names and we give a formula (rocket/rewards.py)
-    mass_weight: Schedule = 0.0  # factor on `mass_rewards`, where the engine cuts off at the target's energy
-    weight_average: float = 0.0  # decay, per optimiser step, of the averaged weights used in evaluation
+    # factor on `mass_rewards`, where the engine cuts off at the target's energy
+    mass_weight: flags.WeightSchedule = Schedule(0.0)
+    weight_average: flags.Decay = 0.0  # decay, per optimiser step, of the averaged weights used in evaluation
+
+    def __post_init__(self):
+        flags.parse_schedules(self)
 
 
 # Recipes: the values that we replace (docs/decisions.md has Table 1's beside them, docs/method.md the reasons) --------
@@ -180,10 +191,11 @@ def has_draws(args):
     return bool(args.dispersion or args.failure)
 
 
-def recipe(args):
+def recipe(args, anew=False):
     """What our recipe changes for the environments of `args`. An id without a recipe takes CUTOFF or FIXED.
 
-    With draws, training begins with --checkpoint or with the policy that is shipped for the id.
+    With draws, training begins with --checkpoint or with the policy that is shipped for the id. `anew` leaves the
+    shipped policy out.
     """
     family = CUTOFF if ROCKETS[args.env_id].cutoff else FIXED
     changes = RECIPES.get(args.env_id, family)
@@ -193,7 +205,9 @@ def recipe(args):
     shipped = dict(FIRST_POLICY)
     if args.failure:
         shipped |= FIRST_OF_FAILING
-    first_policy = shipped.get(args.env_id) if args.checkpoint is None else args.checkpoint
+    if anew:
+        shipped = {}
+    first_policy = args.checkpoint or shipped.get(args.env_id)
     if not first_policy:
         flag = "--dispersion" if args.dispersion else "--failure"
         todo = f"train without {flag} first, and name that policy by --checkpoint"
@@ -209,11 +223,15 @@ ENV_OPTIONS = (  # arguments of the environments
     "observe_phase", "dispersion", "observe_draw", "observe_mass", "failure", "failure_time", "navigation_noise",
 )  # fmt: skip
 FIXED_OPTIONS = {"action_frame": "local"}  # arguments that no flag sets; local is up, along-track, cross-track
-BUFFERS = {env_id: policy_constants(mission.rocket) for env_id, mission in ROCKETS.items()}  # read as agent.<name>
 INITIAL_ACTION = [1.0, 0.0, 0.0]  # straight up (local frame), since a randomly steered rocket never leaves the ground
 OBSERVED = 9  # numbers that every rocket shows: r, v, m, t_norm, phase; the draw comes after them
 LENGTH = 64  # in 100 km, about the Earth's radius
 SPEED = 8  # in km/s, about the circular speed at that radius
+
+
+def constants(env_id):
+    """The buffers of an environment's agents, saved with the weights; `features` reads them as agent.<name>."""
+    return policy_constants(ROCKETS[env_id].rocket)
 
 
 class Motion(NamedTuple):
@@ -274,11 +292,11 @@ def features(agent, obs):
     one_hot = ((phase - agent.phases).abs() < 1e-3).to(obs.dtype)  # phase: 0 to 1 (the paper's 0 to 3)
 
     differs = (compared(m) - nominal_at(agent, phase, m.energy)) / agent.differences
-    differs = torch.where(agent.nominal_flight.any(), differs.clamp(-10, 10), 0.0)
+    differs = torch.where(has_nominal_flight(agent), differs.clamp(-10, 10), 0.0)
 
     seen = [m.r, m.v, m.altitude, m.climb, m.out_of_plane, m.speed, time_left, m.log_mass, one_hot]
     seen += [m.error, (10 * m.error).tanh()]
-    seen += [draw, differs]  # last: `before_training` clears their weights
+    seen += [draw, differs]  # last: `show_differences` clears their weights
     return torch.cat(seen, dim=-1)
 
 
@@ -301,8 +319,8 @@ def describe(episodes, metrics):
 
 
 # Problem, ours: what only training changes ----------------------------------------------------------------------------
-def set_curriculum(envs, args, progress):
-    """Set what only training changes. Returns how many flights in a row have the same start or draw.
+def curriculum(args, progress):
+    """What this update hands over to the environments, by name (`RocketTraining` of rocket/environment.py).
 
     R_terminal is -2 ln(1 + error / scale). Errors below the scale earn almost the same. Noise scatters the errors of
     the flights by about std / 10. We set the scale a little above that: it falls with the noise, as std / 8, if
@@ -312,29 +330,31 @@ def set_curriculum(envs, args, progress):
     With failures at random moments, every second update flies failures of the last stage at its ignition. They are the
     hardest to save, and rare among random ones.
     """
-    envs.terminal_scale = TERMINAL_SCALE
-    if isinstance(args.log_std, str):
-        std = math.exp(value_at(args.log_std, progress))
+    training = {
+        "flights_per_start": round(args.flights_per_start.at(progress)),
+        "guidance": args.guidance,
+        "terminal_scale": TERMINAL_SCALE,
+    }
+    if args.log_std.has_points:
+        std = math.exp(args.log_std.at(progress))
         smallest = 0.001 if has_draws(args) else 0.0
-        envs.terminal_scale = min(TERMINAL_SCALE, max(std / 8, smallest))
-    envs.guidance = args.guidance
+        training["terminal_scale"] = min(TERMINAL_SCALE, max(std / 8, smallest))
     if args.failure and args.failure_time == "random":
         updates_before = round(progress * (args.total_updates - 1))
-        envs.failure_time = "ignition" if updates_before % 2 else "random"
-    group = round(value_at(args.flights_per_start, progress))
-    envs.flights_per_start = group
-    return group
+        training["failure_time"] = "ignition" if updates_before % 2 else "random"
+    return training
 
 
-def add_rewards(envs, args, progress, batch, episodes):
+def add_rewards(args, progress, training, envs, batch, episodes):
     """With cut-off, add `mass_rewards` to the flights' last steps."""
-    weight = value_at(args.mass_weight, progress)
+    weight = args.mass_weight.at(progress)
     if not envs.cutoff or weight == 0:
         return
-    group = len(episodes["error"])  # without draws all flights of all processes have the same start
+    compared_flights = runs.gathered(episodes)  # of all processes
+    group = len(compared_flights["error"])  # without draws all flights have the same start
     if has_draws(args):
-        group = envs.flights_per_start
-    paid = weight * mass_rewards(episodes, envs.rocket, envs.terminal_scale, group)
+        group = training["flights_per_start"]
+    paid = weight * mass_rewards(compared_flights, envs.rocket, training["terminal_scale"], group)
     paid = runs.local_shard(paid, envs.num_envs)  # the part of this process's flights
     last_step = batch.alive.sum(0).long() - 1  # (N,)
     flight = torch.arange(envs.num_envs)
@@ -354,34 +374,38 @@ def nominal_at(agent, phase, energy):
     energy still to gain, and what they will still add to their orbits is nearly the same. So the difference of their
     orbits now is about their difference at the end.
 
-    `nominal_flight` has one row for each step. Between two rows of a burn the values are linear in the energy. Beyond
-    a burn's first or last row the nearest two rows are extrapolated. Energies are between -1 and 0 and rise within a
-    burn. So burn + energy rises over the whole flight, and one sorted key finds the row. In a coast the energy and the
-    orbit stay as they are, so the coast's first row is taken.
+    `nominal_flight` has a row for each step: burn, energy and `compared`. Between two rows of a burn the values are
+    linear in the energy. Beyond a burn's first or last row the nearest two rows are extrapolated. In a coast the energy
+    and the orbit stay as they are, so the coast's first row is taken.
     """
     rows = agent.nominal_flight
-    burn = (phase * (len(agent.phases) - 1)).round().contiguous()
-    key = (burn + energy).contiguous()
     burns = rows[:, 0].contiguous()  # searchsorted warns of any other layout
     energies = rows[:, 1].contiguous()
-    first_of_burn = torch.searchsorted(burns, burn)
-    last_of_burn = torch.searchsorted(burns, burn, right=True) - 1
+    burn = (phase * (len(agent.phases) - 1)).round().contiguous()
+    first = torch.searchsorted(burns, burn)  # the rows of this burn, from `first` to `last`
+    last = torch.searchsorted(burns, burn, right=True) - 1
 
-    after = torch.searchsorted(burns + energies, key)  # the first row whose key is not smaller
-    after = torch.maximum(after, first_of_burn + 1)
-    after = torch.minimum(after, last_of_burn).clamp(min=1)[..., 0]
-    row_before, row_after = rows[after - 1], rows[after]
-    share = (energy - row_before[..., 1:2]) / (row_after[..., 1:2] - row_before[..., 1:2]).clamp(min=1e-7)
-    in_burn = torch.lerp(row_before[..., 2:], row_after[..., 2:], share)
+    # rows are sorted by burn and, within a burn, by energy, which is between -1 and 0: so also by burn + energy
+    above = torch.searchsorted(burns + energies, (burn + energy).contiguous())  # the first row that is not below
+    above = above.maximum(first + 1).minimum(last)  # it and the row below it are of this burn
+    above = above.clamp(min=1)[..., 0]  # also where the table is still empty
+    row_below, row_above = rows[above - 1], rows[above]
+    share = (energy - row_below[..., 1:2]) / (row_above[..., 1:2] - row_below[..., 1:2]).clamp(min=1e-7)
+    in_burn = torch.lerp(row_below[..., 2:], row_above[..., 2:], share)
 
-    begins = first_of_burn.clamp(max=len(rows) - 1)
-    coasts = energies[last_of_burn] - energies[begins] < 1e-6
+    begins = first.clamp(max=len(rows) - 1)
+    coasts = energies[last] - energies[begins] < 1e-6
     in_coast = rows[begins[..., 0], 2:]
     return torch.where(coasts, in_coast, in_burn)
 
 
+def has_nominal_flight(agent):
+    """Whether the agent has a nominal flight, a tensor (). Its first energy is below 0; without a flight it is 0."""
+    return agent.nominal_flight[0, 1] < 0
+
+
 @torch.no_grad()
-def before_training(agent, args, env_options):
+def show_differences(agent, args, env_options):
     """Before a dispersed training, let its first policy fly the nominal flight, and store this flight in the agent.
 
     The draw and the differences are new inputs to that policy. Their weights are set to 0, so the policy flies as
@@ -392,7 +416,7 @@ def before_training(agent, args, env_options):
         return
     if args.failure:
         widen_differences(agent)
-    if agent.nominal_flight.any():  # a policy of a dispersed training has its nominal flight already
+    if has_nominal_flight(agent):  # a policy of a dispersed training has its nominal flight already
         return
     exact = {**env_options, "dispersion": 0.0, "failure": 0.0, "navigation_noise": None}
     envs = gym.make_vec(args.env_id, num_envs=1, **exact)
@@ -534,11 +558,20 @@ class RelativeAttention(nn.Module):
         """
         kv, projections, R = cache
         L = self.memory_length
+        q, kv_of_step = self.project(x, projections)
+        kv[:, :, :, t + L : t + L + 1] = kv_of_step
+        return self.attend(q, kv[:, :, :, t : t + L + 1], R)
+
+    def project(self, x, projections):
+        """One step's query (N, H, 1, dk), and its key and value (2, N, H, 1, dk), of x (N, d)."""
         qkv = F.linear(x, projections)  # (N, 3 d)
-        qkv = qkv.view(len(x), 3, self.num_heads, 1, self.dk).transpose(0, 1)  # (3, N, H, 1, dk)
-        kv[:, :, :, t + L : t + L + 1] = qkv[1:]
-        k, v = kv[:, :, :, t : t + L + 1]  # (N, H, L + 1, dk)
-        scores = qkv[0] @ (k + R).transpose(-1, -2)  # (N, H, 1, L + 1)
+        qkv = qkv.view(-1, 3, self.num_heads, 1, self.dk).transpose(0, 1)  # (3, N, H, 1, dk)
+        return qkv[0], qkv[1:]
+
+    def attend(self, q, window, R):
+        """MultiHead(x) (N, d) of one step, from its query and the window's keys and values (2, N, H, L + 1, dk)."""
+        k, v = window  # (N, H, L + 1, dk)
+        scores = q @ (k + R).transpose(-1, -2)  # (N, H, 1, L + 1)
         attended = scores.softmax(dim=-1) @ v  # (N, H, 1, dk)
         return self.out(attended.flatten(1))
 
@@ -583,9 +616,9 @@ class Agent(nn.Module):
         self.memory_length = args.memory_length
         self.embed_dim = d
 
-        # buffers of the problem, saved with the weights; `features` and `mean_action` read them as agent.<name>
-        constants = {**BUFFERS[args.env_id], "action_scale": envs.single_action_space.high.tolist()}
-        for name, value in constants.items():
+        # saved with the weights; `features` and `mean_action` read them as agent.<name>
+        buffers = {**constants(args.env_id), "action_scale": envs.single_action_space.high.tolist()}
+        for name, value in buffers.items():
             self.register_buffer(name, torch.tensor(value))
         any_observation = torch.ones(envs.single_observation_space.shape)  # only the number of its features is used
         inputs = len(features(self, any_observation))
@@ -596,8 +629,8 @@ class Agent(nn.Module):
         self.actor = nn.Sequential(linear(d, hidden, gain=2**0.5), nn.GELU(), linear(hidden, actions, gain=0.01))
         self.actor[-1].bias.data[:] = torch.tensor(INITIAL_ACTION)
         self.critic = nn.Sequential(linear(d, hidden, gain=2**0.5), nn.GELU(), linear(hidden, 1))
-        learned = not isinstance(args.log_std, str)  # a number is where learning begins; points are set
-        self.actor_logstd = nn.Parameter(torch.full((actions,), value_at(args.log_std, 0.0)), requires_grad=learned)
+        learned = not args.log_std.has_points  # a number is where learning begins; points are set
+        self.actor_logstd = nn.Parameter(torch.full((actions,), args.log_std.at(0.0)), requires_grad=learned)
 
     def new_memory(self, num_envs, noise):
         """m_0 ~ N(0, noise^2), drawn once per episode and block: (blocks, N, L, d)."""
@@ -684,11 +717,12 @@ class Batch:
 
 
 @torch.no_grad()
-def rollout(agent, envs, reward_scale, memory_noise):
-    """Fly one episode in each environment (lines 3-13).
+def rollout(agent, envs, training, reward_scale, memory_noise):
+    """Fly one episode in each environment (lines 3-13). `training` is what `curriculum` hands over to them.
 
-    Returns this process's Batch, and {key: (episodes, ...)} of `final_info` for the episodes of all processes.
+    Returns the Batch, and {key: (N, ...)}, the `final_info` of its episodes.
     """
+    next_obs, _ = envs.reset(options={"training": training})
     T, N = envs.episode_steps, envs.num_envs
     zeros = agent.actor_logstd.new_zeros  # on the agent's device, in its precision
     batch = Batch(
@@ -706,7 +740,6 @@ def rollout(agent, envs, reward_scale, memory_noise):
     alive_at = np.zeros((T, N))
     alive = np.ones(N, dtype=bool)
     episodes = {}  # `final_info` of each environment's first episode
-    next_obs, _ = envs.reset()
     batch.obs[:] = torch.as_tensor(next_obs)  # no step stays zero: the features of zeros could be NaN
 
     for t in range(T):  # line 6
@@ -728,9 +761,7 @@ def rollout(agent, envs, reward_scale, memory_noise):
     batch.alive[:] = torch.as_tensor(alive_at)
     # v_t of line 8 and log pi(a_t). Sampling needs neither, so one call computes them for all steps.
     batch.logprobs, _, batch.critic = agent.evaluate_actions(hidden, batch.actions)
-    of_each_process = runs.all_gather(episodes)
-    all_episodes = {key: np.concatenate([part[key] for part in of_each_process]) for key in episodes}
-    return batch, all_episodes
+    return batch, episodes
 
 
 def gae(rewards, values, alive, gamma, gae_lambda):
@@ -752,10 +783,10 @@ def gae(rewards, values, alive, gamma, gae_lambda):
 
 
 def moments(x, alive, dim):
-    """Mean and variance of x (T, N, ...) along dim, over the living steps of all processes. dim is kept as 1."""
-    count = all_reduce_sum(alive.sum(dim, keepdim=True)).clamp(min=1)
-    mean = all_reduce_sum((x * alive).sum(dim, keepdim=True)) / count
-    variance = all_reduce_sum(((x - mean) ** 2 * alive).sum(dim, keepdim=True)) / count
+    """Mean and variance of x (T, N, ...) along dim, over the living steps. dim is kept as 1."""
+    count = runs.total(alive.sum(dim, keepdim=True)).clamp(min=1)
+    mean = runs.total((x * alive).sum(dim, keepdim=True)) / count
+    variance = runs.total(((x - mean) ** 2 * alive).sum(dim, keepdim=True)) / count
     return mean, variance
 
 
@@ -770,12 +801,12 @@ def ppo_loss(agent, batch, mb, clip_coef, vf_coef, ent_coef):
     """The loss -L_CLIP + c1 L_VF - c2 H over the living steps of the episodes `mb`, and the means that are logged.
 
     L_CLIP is Eq. (11). Line 18 prints L_CLIP + c1 L_VF - c2 H. Our sign of L_CLIP raises it where the loss is
-    minimised. L_VF is 1/2 (critic - target)^2. Under torchrun the loss is this process's part of the mean, and
-    `ppo_gradient` sums the gradients. What is logged is the mean over all processes.
+    minimised. L_VF is 1/2 (critic - target)^2. With several processes `runs.total` sums over them: the loss is this
+    process's part of the mean, and what is logged is the whole mean.
     """
     alive = batch.alive[:, mb]
     advantages = batch.advantages[:, mb]
-    steps = all_reduce_sum(alive.sum())
+    steps = runs.total(alive.sum())
 
     def mean(x):
         return (x * alive).sum() / steps
@@ -800,8 +831,8 @@ def ppo_loss(agent, batch, mb, clip_coef, vf_coef, ent_coef):
         losses["old_approx_kl"] = mean(-logratio)
         losses["approx_kl"] = mean((ratio - 1) - logratio)
         losses["clipfrac"] = mean(((ratio - 1.0).abs() > clip_coef).to(ratio.dtype))
-    of_all_processes = all_reduce_sum(torch.stack([value.detach() for value in losses.values()]))
-    return loss, dict(zip(losses, of_all_processes))
+    means = runs.total(torch.stack([value.detach() for value in losses.values()]))
+    return loss, dict(zip(losses, means))
 
 
 def ppo_gradient(args, agent, batch, mb, ent_coef):
@@ -812,26 +843,12 @@ def ppo_gradient(args, agent, batch, mb, ent_coef):
     loss, losses = ppo_loss(agent, batch, mb, args.clip_coef, args.vf_coef, ent_coef)
     agent.zero_grad()
     loss.backward()
-    runs.sum_gradients(agent)  # over the processes of torchrun
+    runs.total([weight.grad for weight in agent.parameters() if weight.grad is not None])  # of all processes
     losses["gradient_norm"] = nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
     return losses
 
 
 # Shared, ours: what we add to PPO -------------------------------------------------------------------------------------
-def value_at(schedule, progress):
-    """The value of a schedule at `progress`, which is 0 in the first update and 1 in the last.
-
-    A number is constant. Points "0:-1 0.4:-2 1:-6" are joined by lines. If two points have one place, the second counts
-    from there on.
-    """
-    if not isinstance(schedule, str):
-        return float(schedule)
-    points = [point.split(":") for point in schedule.split()]
-    places = [float(place) for place, _ in points]
-    values = [float(value) for _, value in points]
-    return float(np.interp(progress, places, values))
-
-
 def set_log_std(agent, args, progress):
     """Set the log-std of this update if --log-std is a schedule. Clamp it if it is learned.
 
@@ -840,7 +857,7 @@ def set_log_std(agent, args, progress):
     if agent.actor_logstd.requires_grad:
         agent.actor_logstd.data.clamp_(*LOG_STD_RANGE)
     else:
-        agent.actor_logstd.data.fill_(value_at(args.log_std, progress))
+        agent.actor_logstd.data.fill_(args.log_std.at(progress))
 
 
 def learning_rate_of(agent, args, progress):
@@ -851,7 +868,7 @@ def learning_rate_of(agent, args, progress):
     learning rate is in proportion to the std, a step changes the policy by about the same KL at any noise, and the
     policy still learns when the noise is small.
     """
-    learning_rate = value_at(args.learning_rate, progress)
+    learning_rate = args.learning_rate.at(progress)
     if not args.lr_times_std:
         return learning_rate
     return learning_rate * agent.actor_logstd.exp().mean().item()
@@ -884,6 +901,9 @@ def linear_fit(x, y, alive):
     return fitted[..., 0].to(alive.dtype)
 
 
+SMALLEST_SPREAD = 0.3  # of the mean spread; a step of almost no spread would be divided by almost 0
+
+
 def returns_baseline(batch, gamma, group):
     """The baseline (T, N) and the scale (T, 1) of the value V(s_t) = baseline_t + scale_t * critic(s_t).
 
@@ -892,8 +912,7 @@ def returns_baseline(batch, gamma, group):
 
     Each `group` of neighbouring episodes flew the same start. Their returns from step t on are regressed linearly on
     their observations at step t. The fit is the baseline. Its residuals have a spread at each step, over all flights of
-    all groups. scale^2 is the spread^2 of the step plus (0.3 x the mean spread of the steps)^2. Without the second term
-    a step of almost no spread would be divided by almost 0.
+    all groups. scale^2 is the spread^2 of the step plus (SMALLEST_SPREAD x the mean spread of the steps)^2.
 
     RLOO (Kool et al. 2019) takes the mean return of the other samples of a question as the baseline. GRPO (Shao et al.
     2024) takes the mean return of the whole group, and divides by the group's spread. Both have one return for each
@@ -909,7 +928,7 @@ def returns_baseline(batch, gamma, group):
     baseline = linear_fit(obs, grouped_returns, alive).flatten(1)
     _, variance = moments(monte_carlo - baseline, batch.alive, 1)
     mean_spread = variance.sqrt().mean()  # steps that no flight reaches count as zeros
-    scale = (variance + (0.3 * mean_spread) ** 2 + 1e-8).sqrt()
+    scale = (variance + (SMALLEST_SPREAD * mean_spread) ** 2 + 1e-8).sqrt()
     return baseline, scale
 
 
@@ -931,19 +950,20 @@ def train(args, agent, average, optimizer, envs, run, gradient=ppo_gradient):
     target_kl = math.inf if args.target_kl is None else args.target_kl
     for iteration in range(run.updates_done + 1, args.total_updates + 1):  # line 2
         progress = (iteration - 1) / max(args.total_updates - 1, 1)
-        memory_noise = value_at(args.memory_noise, progress)
-        gae_lambda = value_at(args.gae_lambda, progress)
-        ent_coef = value_at(args.ent_coef, progress)
+        memory_noise = args.memory_noise.at(progress)
+        gae_lambda = args.gae_lambda.at(progress)
+        ent_coef = args.ent_coef.at(progress)
         set_log_std(agent, args, progress)
         learning_rate = learning_rate_of(agent, args, progress)
         optimizer.param_groups[0]["lr"] = learning_rate
-        group = set_curriculum(envs, args, progress)  # ours
+        training = curriculum(args, progress)  # ours
 
         # lines 3-13: fly one episode in every environment
-        batch, episodes = rollout(agent, envs, args.reward_scale, memory_noise)
-        add_rewards(envs, args, progress, batch, episodes)  # ours
+        batch, episodes = rollout(agent, envs, training, args.reward_scale, memory_noise)
+        add_rewards(args, progress, training, envs, batch, episodes)  # this problem
 
         # line 14: returns and advantages
+        group = training["flights_per_start"]
         baseline, scale = returns_baseline(batch, args.gamma, group)  # ours; 0 and 1 with group 1
         values = baseline + scale * batch.critic
         advantages, returns = gae(batch.rewards, values, batch.alive, args.gamma, gae_lambda)
@@ -973,13 +993,13 @@ def train(args, agent, average, optimizer, envs, run, gradient=ppo_gradient):
 
 def main(argv):
     """Train and evaluate, or with --eval-only evaluate, by the flags `argv`."""
-    args, saved = runs.parse_args(Args, recipe, argv, ENV_OPTIONS, BUFFERS)
+    args, saved = runs.parse_args(sys.modules[__name__], argv)
     device = runs.prepare_torch(args)
     env_options = {name: getattr(args, name) for name in ENV_OPTIONS} | FIXED_OPTIONS
     envs = runs.make_envs(args, env_options)
     agent = Agent(args, envs).to(device)  # line 1
     runs.load_checkpoint(agent, args, saved)
-    before_training(agent, args, env_options)
+    show_differences(agent, args, env_options)  # this problem
     average = AveragedModel(agent, multi_avg_fn=get_ema_multi_avg_fn(args.weight_average))
     optimizer = torch.optim.Adam(agent.parameters(), eps=1e-5, fused=True)  # train sets its learning rate
     run = runs.Run(

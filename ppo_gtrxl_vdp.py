@@ -7,9 +7,9 @@
     python ppo_gtrxl_vdp.py --eval-only --checkpoint results/vdp/agent.safetensors
 
 Reading order: arguments, recipes, problem, Gated Transformer-XL, agent, PPO, what we add to PPO, training, main.
-From the first section "Shared" on, all ppo_gtrxl_*.py are the same to the letter. A section with "ours" in its heading
-contains nothing from the paper. In the other sections a comment marks what is ours. "Line 8" means line 8 of
-Algorithm 1, "Eq. (7)" the seventh numbered equation of the paper.
+From the first section "Shared" on, all ppo_gtrxl_*.py are the same but for lines that end with "# this problem". A
+section with "ours" in its heading contains nothing from the paper. In the other sections a comment marks what is ours.
+"Line 8" means line 8 of Algorithm 1, "Eq. (7)" the seventh numbered equation of the paper.
 
 T is the number of steps, N of environments, H of heads. L is the memory length, d the width, and dk = d / H.
 Algorithm 1 writes E for our N, and N for its iterations.
@@ -21,8 +21,10 @@ Eq. (19). The problems' tables are in envs.py, cost, reward and observation in p
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -32,10 +34,10 @@ from torch.distributions import Normal
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 import runs
-from common.tasks import ForEachId
+from common import flags
+from common.schedule import Schedule
 from cuda_graphs import speed_up
 from envs import PROBLEMS, own_ids
-from runs import Schedule, all_reduce_sum
 
 
 @dataclass
@@ -44,16 +46,16 @@ class Args:
 
     --recipe paper uses these values. --recipe ours, the default, first replaces those that RECIPES names. A flag that
     is typed wins over both. A Schedule is one number, or points "place:value place:value ...". Place 0 is the first
-    update, place 1 the last (`value_at`).
+    update, place 1 the last. The types are in common/flags.py: what each flag takes, and whether a policy decides it.
     """
 
     # experiment
     exp_name: str = Path(__file__).stem  # the name of this experiment
-    seed: int = 1  # seed of the experiment
-    recipe: str = "ours"  # what the flags that are not typed are: "paper" (these values) or "ours" (RECIPES first)
+    seed: flags.Natural = 1  # seed of the experiment
+    recipe: flags.Recipe = "ours"  # what the untyped flags are: "paper" (these values) or "ours" (RECIPES first)
     torch_deterministic: bool = True  # if toggled, `torch.backends.cudnn.deterministic=True`
     cuda: bool = True  # if toggled, a GPU is used when there is one
-    num_threads: int = 1  # CPU threads of torch (0: torch's own choice); the bits of the results depend on it
+    num_threads: flags.Threads = 1  # CPU threads of torch (0: torch's own choice); the bits of the results depend on it
     torch_compile: bool = False  # compile the network (on a GPU: CUDA graphs), for a slower start and faster updates
     track: bool = False  # if toggled, this experiment will be tracked with Weights and Biases
     wandb_project_name: str = "ppo-gtrxl"  # the wandb's project name
@@ -63,48 +65,52 @@ class Args:
     checkpoint: str | None = None  # start from these weights (.safetensors)
     resume: str | None = None  # go on with the interrupted run in this run folder, bit for bit
     eval_only: bool = False  # fly the mean action of --checkpoint, train nothing, write only --eval-json and --eval-npz
-    eval_starts: int | None = None  # number of evaluation starts (default 1000; 50 in a training cut short)
-    eval_seed: int = 0  # seed of the evaluation starts
+    eval_starts: flags.Starts | None = None  # number of evaluation starts (default 1000; 50 in a training cut short)
+    eval_seed: flags.Natural = 0  # seed of the evaluation starts
     eval_json: str | None = None  # where --eval-only writes the metrics
     eval_npz: str | None = None  # where --eval-only writes the trajectories
-    eval_every: int = 10  # updates between two evaluations, which have their own starts (0: only at the end)
+    eval_every: flags.Natural = 10  # updates between two evaluations, which have their own starts (0: only at the end)
 
     # environment
     env_id: str = "VanDerPol-v0"  # the id of the environment, one of ENV_IDS
-    observe_phase: bool = True  # show time and phase to the policy
-    observe_velocity: bool = True  # show the velocity to the policy
+    observe_phase: flags.Observed = True  # show time and phase to the policy
+    observe_velocity: flags.Observed = True  # show the velocity to the policy
 
     # Table 1
-    num_blocks: int = 3  # number of GTrXL blocks (0: a plain MLP, without memory)
-    embed_dim: int = 128  # embedding dimension d
-    num_heads: int = 2  # number of attention heads
-    memory_length: int = 32  # memory length L: a step attends to itself and the L steps before it
-    mlp_dim: int = 128  # width of the position-wise MLP
-    hidden_dim: int = 256  # width of the hidden layer of each head
-    gamma: float = 0.99  # the discount factor gamma
-    gae_lambda: Schedule = 0.95  # the lambda for the general advantage estimation
-    total_updates: int = 1000  # number of updates
-    update_epochs: int = 10  # the K epochs to update the policy
-    vf_coef: float = 0.2  # coefficient of the value function
-    learning_rate: Schedule = "0:3e-4 1:3e-5"  # the learning rate of the optimizer
-    ent_coef: Schedule = "0:1e-3 1:1e-4"  # coefficient of the entropy
-    clip_coef: float = 0.2  # the surrogate clipping coefficient
+    num_blocks: flags.Blocks = 3  # number of GTrXL blocks (0: a plain MLP, without memory)
+    embed_dim: flags.Width = 128  # embedding dimension d
+    num_heads: flags.Width = 2  # number of attention heads
+    memory_length: flags.Length = 32  # memory length L: a step attends to itself and the L steps before it
+    mlp_dim: flags.Width = 128  # width of the position-wise MLP
+    hidden_dim: flags.Width = 256  # width of the hidden layer of each head
+    gamma: flags.Share = 0.99  # the discount factor gamma
+    gae_lambda: flags.ShareSchedule = Schedule(0.95)  # the lambda for the general advantage estimation
+    total_updates: flags.Count = 1000  # number of updates
+    update_epochs: flags.Count = 10  # the K epochs to update the policy
+    vf_coef: flags.Weight = 0.2  # coefficient of the value function
+    learning_rate: flags.ShareSchedule = Schedule("0:3e-4 1:3e-5")  # the learning rate of the optimizer
+    ent_coef: flags.WeightSchedule = Schedule("0:1e-3 1:1e-4")  # coefficient of the entropy
+    clip_coef: flags.Share = 0.2  # the surrogate clipping coefficient
 
     # not in Table 1: our choice
-    num_envs: int = 117  # parallel environments, one episode each per update (512 steps of 16 workers, a guess)
-    num_minibatches: int = 4  # the number of mini-batches of whole episodes
+    num_envs: flags.Count = 117  # parallel environments, one episode each per update (512 steps of 16 workers, a guess)
+    num_minibatches: flags.Count = 4  # the number of mini-batches of whole episodes
     norm_adv: bool = True  # normalise the advantages over an update
-    max_grad_norm: float = 0.5  # the maximum norm for the gradient clipping
-    target_kl: float | None = None  # the KL divergence from which an update takes no further step (None: no limit)
-    log_std: Schedule = -0.5  # log of the std in the action's unit. A number: learned from there; points: not learned
-    memory_noise: Schedule = 0.1  # std of the memory before an episode (Algorithm 1, line 5; the text says "small")
-    reward_scale: float = 1.0  # factor on the rewards in training; losses are logged with it, returns without
+    max_grad_norm: flags.Positive = 0.5  # the maximum norm for the gradient clipping
+    target_kl: flags.Positive | None = None  # the KL divergence at which an update takes no further step (None: never)
+    log_std: flags.LogStd = Schedule(-0.5)  # log of the action's std. A number: learned from there; points: not learned
+    memory_noise: flags.ShareSchedule = Schedule(0.1)  # std of the memory before an episode (Algorithm 1, line 5)
+    reward_scale: flags.Positive = 1.0  # factor on the rewards in training; losses are logged with it, returns without
 
     # ours: off here, on in RECIPES
     lr_times_std: bool = False  # the learning rate is --learning-rate times the policy's std
-    flights_per_start: Schedule = 1  # flights of each start, compared with one another
-    log_radius: Schedule = 0.0  # waypoints: log of the training radius in target radii
-    weight_average: float = 0.0  # decay, per optimiser step, of the averaged weights used in evaluation
+    flights_per_start: flags.CountSchedule = Schedule(1)  # flights of each start, compared with one another
+    # waypoints: log of the training radius in target radii
+    log_radius: Annotated[Schedule, flags.Range(-5.0, 14.0)] = Schedule(0.0)
+    weight_average: flags.Decay = 0.0  # decay, per optimiser step, of the averaged weights used in evaluation
+
+    def __post_init__(self):
+        flags.parse_schedules(self)
 
 
 # Recipes: the values that we replace (docs/decisions.md has Table 1's beside them, docs/method.md the reasons) --------
@@ -176,8 +182,12 @@ def recipe(args):
 ENV_IDS = ("VanDerPol-v0", "VanDerPolWaypoints-v0", *own_ids())  # and problems of your own
 ENV_OPTIONS = ("observe_phase", "observe_velocity")  # arguments of the environments
 FIXED_OPTIONS = {"scaled_action": True}  # arguments that no flag sets
-BUFFERS = ForEachId(ENV_IDS, runs.observation_scale)  # by environment id; `features` reads them as agent.<name>
 INITIAL_ACTION = [0.0]  # the policy's output before training, in units of the bound
+
+
+def constants(env_id):
+    """The buffers of an environment's agents, saved with the weights; `features` reads them as agent.<name>."""
+    return {"observation_scale": runs.observation_scale(env_id)}
 
 
 def features(agent, obs):
@@ -206,8 +216,8 @@ def describe(episodes, metrics):
 BONUS_WIDTH = 0.4
 
 
-def set_curriculum(envs, args, progress):
-    """Set what only training changes. Returns how many flights in a row have the same start.
+def curriculum(args, progress):
+    """What this update hands over to the environments, by name (`PhasedTraining` of phased/environment.py).
 
     At first every flight has its own start. Later several flights share a start and are compared.
 
@@ -217,20 +227,13 @@ def set_curriculum(envs, args, progress):
     unit of distance. A miss saves at most 7 for each unit (`circle_price` of baselines.py), so it does not pay. A
     steeper fall would hide the cost.
     """
-    group = round(value_at(args.flights_per_start, progress))
-    envs.flights_per_start = group
-    if envs.has_circles:
-        envs.radius_scale = math.exp(value_at(args.log_radius, progress))
-        envs.bonus_width = BONUS_WIDTH if group > 1 else 0.0
-    return group
-
-
-def add_rewards(envs, args, progress, batch, episodes):
-    """Does nothing here. Training is paid what the environment pays; the rocket's script adds to it."""
-
-
-def before_training(agent, args, env_options):
-    """Does nothing here. The rocket's script prepares its agent for vehicles that differ."""
+    group = round(args.flights_per_start.at(progress))
+    training = {"flights_per_start": group}
+    problem = PROBLEMS.get(args.env_id)
+    if problem and problem.circles_count:
+        training["radius_scale"] = math.exp(args.log_radius.at(progress))
+        training["bonus_width"] = BONUS_WIDTH if group > 1 else 0.0
+    return training
 
 
 # Shared: Gated Transformer-XL ("Gated Transformer-XL Implementation") -------------------------------------------------
@@ -340,11 +343,20 @@ class RelativeAttention(nn.Module):
         """
         kv, projections, R = cache
         L = self.memory_length
+        q, kv_of_step = self.project(x, projections)
+        kv[:, :, :, t + L : t + L + 1] = kv_of_step
+        return self.attend(q, kv[:, :, :, t : t + L + 1], R)
+
+    def project(self, x, projections):
+        """One step's query (N, H, 1, dk), and its key and value (2, N, H, 1, dk), of x (N, d)."""
         qkv = F.linear(x, projections)  # (N, 3 d)
-        qkv = qkv.view(len(x), 3, self.num_heads, 1, self.dk).transpose(0, 1)  # (3, N, H, 1, dk)
-        kv[:, :, :, t + L : t + L + 1] = qkv[1:]
-        k, v = kv[:, :, :, t : t + L + 1]  # (N, H, L + 1, dk)
-        scores = qkv[0] @ (k + R).transpose(-1, -2)  # (N, H, 1, L + 1)
+        qkv = qkv.view(-1, 3, self.num_heads, 1, self.dk).transpose(0, 1)  # (3, N, H, 1, dk)
+        return qkv[0], qkv[1:]
+
+    def attend(self, q, window, R):
+        """MultiHead(x) (N, d) of one step, from its query and the window's keys and values (2, N, H, L + 1, dk)."""
+        k, v = window  # (N, H, L + 1, dk)
+        scores = q @ (k + R).transpose(-1, -2)  # (N, H, 1, L + 1)
         attended = scores.softmax(dim=-1) @ v  # (N, H, 1, dk)
         return self.out(attended.flatten(1))
 
@@ -389,9 +401,9 @@ class Agent(nn.Module):
         self.memory_length = args.memory_length
         self.embed_dim = d
 
-        # buffers of the problem, saved with the weights; `features` and `mean_action` read them as agent.<name>
-        constants = {**BUFFERS[args.env_id], "action_scale": envs.single_action_space.high.tolist()}
-        for name, value in constants.items():
+        # saved with the weights; `features` and `mean_action` read them as agent.<name>
+        buffers = {**constants(args.env_id), "action_scale": envs.single_action_space.high.tolist()}
+        for name, value in buffers.items():
             self.register_buffer(name, torch.tensor(value))
         any_observation = torch.ones(envs.single_observation_space.shape)  # only the number of its features is used
         inputs = len(features(self, any_observation))
@@ -402,8 +414,8 @@ class Agent(nn.Module):
         self.actor = nn.Sequential(linear(d, hidden, gain=2**0.5), nn.GELU(), linear(hidden, actions, gain=0.01))
         self.actor[-1].bias.data[:] = torch.tensor(INITIAL_ACTION)
         self.critic = nn.Sequential(linear(d, hidden, gain=2**0.5), nn.GELU(), linear(hidden, 1))
-        learned = not isinstance(args.log_std, str)  # a number is where learning begins; points are set
-        self.actor_logstd = nn.Parameter(torch.full((actions,), value_at(args.log_std, 0.0)), requires_grad=learned)
+        learned = not args.log_std.has_points  # a number is where learning begins; points are set
+        self.actor_logstd = nn.Parameter(torch.full((actions,), args.log_std.at(0.0)), requires_grad=learned)
 
     def new_memory(self, num_envs, noise):
         """m_0 ~ N(0, noise^2), drawn once per episode and block: (blocks, N, L, d)."""
@@ -490,11 +502,12 @@ class Batch:
 
 
 @torch.no_grad()
-def rollout(agent, envs, reward_scale, memory_noise):
-    """Fly one episode in each environment (lines 3-13).
+def rollout(agent, envs, training, reward_scale, memory_noise):
+    """Fly one episode in each environment (lines 3-13). `training` is what `curriculum` hands over to them.
 
-    Returns this process's Batch, and {key: (episodes, ...)} of `final_info` for the episodes of all processes.
+    Returns the Batch, and {key: (N, ...)}, the `final_info` of its episodes.
     """
+    next_obs, _ = envs.reset(options={"training": training})
     T, N = envs.episode_steps, envs.num_envs
     zeros = agent.actor_logstd.new_zeros  # on the agent's device, in its precision
     batch = Batch(
@@ -512,7 +525,6 @@ def rollout(agent, envs, reward_scale, memory_noise):
     alive_at = np.zeros((T, N))
     alive = np.ones(N, dtype=bool)
     episodes = {}  # `final_info` of each environment's first episode
-    next_obs, _ = envs.reset()
     batch.obs[:] = torch.as_tensor(next_obs)  # no step stays zero: the features of zeros could be NaN
 
     for t in range(T):  # line 6
@@ -534,9 +546,7 @@ def rollout(agent, envs, reward_scale, memory_noise):
     batch.alive[:] = torch.as_tensor(alive_at)
     # v_t of line 8 and log pi(a_t). Sampling needs neither, so one call computes them for all steps.
     batch.logprobs, _, batch.critic = agent.evaluate_actions(hidden, batch.actions)
-    of_each_process = runs.all_gather(episodes)
-    all_episodes = {key: np.concatenate([part[key] for part in of_each_process]) for key in episodes}
-    return batch, all_episodes
+    return batch, episodes
 
 
 def gae(rewards, values, alive, gamma, gae_lambda):
@@ -558,10 +568,10 @@ def gae(rewards, values, alive, gamma, gae_lambda):
 
 
 def moments(x, alive, dim):
-    """Mean and variance of x (T, N, ...) along dim, over the living steps of all processes. dim is kept as 1."""
-    count = all_reduce_sum(alive.sum(dim, keepdim=True)).clamp(min=1)
-    mean = all_reduce_sum((x * alive).sum(dim, keepdim=True)) / count
-    variance = all_reduce_sum(((x - mean) ** 2 * alive).sum(dim, keepdim=True)) / count
+    """Mean and variance of x (T, N, ...) along dim, over the living steps. dim is kept as 1."""
+    count = runs.total(alive.sum(dim, keepdim=True)).clamp(min=1)
+    mean = runs.total((x * alive).sum(dim, keepdim=True)) / count
+    variance = runs.total(((x - mean) ** 2 * alive).sum(dim, keepdim=True)) / count
     return mean, variance
 
 
@@ -576,12 +586,12 @@ def ppo_loss(agent, batch, mb, clip_coef, vf_coef, ent_coef):
     """The loss -L_CLIP + c1 L_VF - c2 H over the living steps of the episodes `mb`, and the means that are logged.
 
     L_CLIP is Eq. (11). Line 18 prints L_CLIP + c1 L_VF - c2 H. Our sign of L_CLIP raises it where the loss is
-    minimised. L_VF is 1/2 (critic - target)^2. Under torchrun the loss is this process's part of the mean, and
-    `ppo_gradient` sums the gradients. What is logged is the mean over all processes.
+    minimised. L_VF is 1/2 (critic - target)^2. With several processes `runs.total` sums over them: the loss is this
+    process's part of the mean, and what is logged is the whole mean.
     """
     alive = batch.alive[:, mb]
     advantages = batch.advantages[:, mb]
-    steps = all_reduce_sum(alive.sum())
+    steps = runs.total(alive.sum())
 
     def mean(x):
         return (x * alive).sum() / steps
@@ -606,8 +616,8 @@ def ppo_loss(agent, batch, mb, clip_coef, vf_coef, ent_coef):
         losses["old_approx_kl"] = mean(-logratio)
         losses["approx_kl"] = mean((ratio - 1) - logratio)
         losses["clipfrac"] = mean(((ratio - 1.0).abs() > clip_coef).to(ratio.dtype))
-    of_all_processes = all_reduce_sum(torch.stack([value.detach() for value in losses.values()]))
-    return loss, dict(zip(losses, of_all_processes))
+    means = runs.total(torch.stack([value.detach() for value in losses.values()]))
+    return loss, dict(zip(losses, means))
 
 
 def ppo_gradient(args, agent, batch, mb, ent_coef):
@@ -618,26 +628,12 @@ def ppo_gradient(args, agent, batch, mb, ent_coef):
     loss, losses = ppo_loss(agent, batch, mb, args.clip_coef, args.vf_coef, ent_coef)
     agent.zero_grad()
     loss.backward()
-    runs.sum_gradients(agent)  # over the processes of torchrun
+    runs.total([weight.grad for weight in agent.parameters() if weight.grad is not None])  # of all processes
     losses["gradient_norm"] = nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
     return losses
 
 
 # Shared, ours: what we add to PPO -------------------------------------------------------------------------------------
-def value_at(schedule, progress):
-    """The value of a schedule at `progress`, which is 0 in the first update and 1 in the last.
-
-    A number is constant. Points "0:-1 0.4:-2 1:-6" are joined by lines. If two points have one place, the second counts
-    from there on.
-    """
-    if not isinstance(schedule, str):
-        return float(schedule)
-    points = [point.split(":") for point in schedule.split()]
-    places = [float(place) for place, _ in points]
-    values = [float(value) for _, value in points]
-    return float(np.interp(progress, places, values))
-
-
 def set_log_std(agent, args, progress):
     """Set the log-std of this update if --log-std is a schedule. Clamp it if it is learned.
 
@@ -646,7 +642,7 @@ def set_log_std(agent, args, progress):
     if agent.actor_logstd.requires_grad:
         agent.actor_logstd.data.clamp_(*LOG_STD_RANGE)
     else:
-        agent.actor_logstd.data.fill_(value_at(args.log_std, progress))
+        agent.actor_logstd.data.fill_(args.log_std.at(progress))
 
 
 def learning_rate_of(agent, args, progress):
@@ -657,7 +653,7 @@ def learning_rate_of(agent, args, progress):
     learning rate is in proportion to the std, a step changes the policy by about the same KL at any noise, and the
     policy still learns when the noise is small.
     """
-    learning_rate = value_at(args.learning_rate, progress)
+    learning_rate = args.learning_rate.at(progress)
     if not args.lr_times_std:
         return learning_rate
     return learning_rate * agent.actor_logstd.exp().mean().item()
@@ -690,6 +686,9 @@ def linear_fit(x, y, alive):
     return fitted[..., 0].to(alive.dtype)
 
 
+SMALLEST_SPREAD = 0.3  # of the mean spread; a step of almost no spread would be divided by almost 0
+
+
 def returns_baseline(batch, gamma, group):
     """The baseline (T, N) and the scale (T, 1) of the value V(s_t) = baseline_t + scale_t * critic(s_t).
 
@@ -698,8 +697,7 @@ def returns_baseline(batch, gamma, group):
 
     Each `group` of neighbouring episodes flew the same start. Their returns from step t on are regressed linearly on
     their observations at step t. The fit is the baseline. Its residuals have a spread at each step, over all flights of
-    all groups. scale^2 is the spread^2 of the step plus (0.3 x the mean spread of the steps)^2. Without the second term
-    a step of almost no spread would be divided by almost 0.
+    all groups. scale^2 is the spread^2 of the step plus (SMALLEST_SPREAD x the mean spread of the steps)^2.
 
     RLOO (Kool et al. 2019) takes the mean return of the other samples of a question as the baseline. GRPO (Shao et al.
     2024) takes the mean return of the whole group, and divides by the group's spread. Both have one return for each
@@ -715,7 +713,7 @@ def returns_baseline(batch, gamma, group):
     baseline = linear_fit(obs, grouped_returns, alive).flatten(1)
     _, variance = moments(monte_carlo - baseline, batch.alive, 1)
     mean_spread = variance.sqrt().mean()  # steps that no flight reaches count as zeros
-    scale = (variance + (0.3 * mean_spread) ** 2 + 1e-8).sqrt()
+    scale = (variance + (SMALLEST_SPREAD * mean_spread) ** 2 + 1e-8).sqrt()
     return baseline, scale
 
 
@@ -737,19 +735,19 @@ def train(args, agent, average, optimizer, envs, run, gradient=ppo_gradient):
     target_kl = math.inf if args.target_kl is None else args.target_kl
     for iteration in range(run.updates_done + 1, args.total_updates + 1):  # line 2
         progress = (iteration - 1) / max(args.total_updates - 1, 1)
-        memory_noise = value_at(args.memory_noise, progress)
-        gae_lambda = value_at(args.gae_lambda, progress)
-        ent_coef = value_at(args.ent_coef, progress)
+        memory_noise = args.memory_noise.at(progress)
+        gae_lambda = args.gae_lambda.at(progress)
+        ent_coef = args.ent_coef.at(progress)
         set_log_std(agent, args, progress)
         learning_rate = learning_rate_of(agent, args, progress)
         optimizer.param_groups[0]["lr"] = learning_rate
-        group = set_curriculum(envs, args, progress)  # ours
+        training = curriculum(args, progress)  # ours
 
         # lines 3-13: fly one episode in every environment
-        batch, episodes = rollout(agent, envs, args.reward_scale, memory_noise)
-        add_rewards(envs, args, progress, batch, episodes)  # ours
+        batch, episodes = rollout(agent, envs, training, args.reward_scale, memory_noise)
 
         # line 14: returns and advantages
+        group = training["flights_per_start"]
         baseline, scale = returns_baseline(batch, args.gamma, group)  # ours; 0 and 1 with group 1
         values = baseline + scale * batch.critic
         advantages, returns = gae(batch.rewards, values, batch.alive, args.gamma, gae_lambda)
@@ -779,13 +777,12 @@ def train(args, agent, average, optimizer, envs, run, gradient=ppo_gradient):
 
 def main(argv):
     """Train and evaluate, or with --eval-only evaluate, by the flags `argv`."""
-    args, saved = runs.parse_args(Args, recipe, argv, ENV_OPTIONS, BUFFERS)
+    args, saved = runs.parse_args(sys.modules[__name__], argv)
     device = runs.prepare_torch(args)
     env_options = {name: getattr(args, name) for name in ENV_OPTIONS} | FIXED_OPTIONS
     envs = runs.make_envs(args, env_options)
     agent = Agent(args, envs).to(device)  # line 1
     runs.load_checkpoint(agent, args, saved)
-    before_training(agent, args, env_options)
     average = AveragedModel(agent, multi_avg_fn=get_ema_multi_avg_fn(args.weight_average))
     optimizer = torch.optim.Adam(agent.parameters(), eps=1e-5, fused=True)  # train sets its learning rate
     run = runs.Run(

@@ -17,12 +17,11 @@ import io
 import json
 import math
 import os
-import re
 import signal
 import sys
 import time
 import zipfile
-from dataclasses import asdict, replace
+from dataclasses import replace
 from itertools import takewhile
 from pathlib import Path
 from typing import Annotated, Any, NoReturn, get_type_hints
@@ -39,10 +38,11 @@ from common import files
 from common.batch import make_batch
 from common.checkpoints import COUNTERS, read_checkpoint
 from common.curves import read_curve
-from common.errors import BadInput, NoOptimum
+from common.errors import BadInput, NoOptimum, refuse_unless
 from common.evaluations import write_evaluation
+from common.flags import Policy, Range, Words, facts, plain_args
+from common.schedule import Schedule
 from common.tasks import Task, task_of
-from common.tasks import env_ids as known_ids
 from drawing.evaluation import draw_animation, draw_figures
 
 gc.freeze()  # imported modules are never garbage, and looking through them takes a fifth of the time of --help
@@ -51,30 +51,6 @@ gc.freeze()  # imported modules are never garbage, and looking through them take
 # Arguments
 # ---------------------------------------------------------------------------------------------------------------------
 
-
-def schedule_of(words):
-    """The schedule that a flag's words give: one number, or points "0:-1 0.4:-2 1:-6" as one string.
-
-    Raises ValueError if they are neither.
-    """
-    if len(words) > 1 or ":" in "".join(words):
-        return " ".join(words)
-    if not words:
-        raise ValueError("must be a number, or points as 0:-1 0.4:-2 1:-6")
-    word = words[0]
-    return int(word) if word.isdigit() else float(word)
-
-
-Schedule = Annotated[
-    float | int | str,
-    tyro.constructors.PrimitiveConstructorSpec(
-        nargs="*",
-        metavar="VALUE | PLACE:VALUE ...",
-        instance_from_str=schedule_of,
-        is_instance=lambda value: isinstance(value, float | int | str),
-        str_from_instance=lambda value: str(value).split(),
-    ),
-]
 Numbers = Annotated[
     list | None,
     tyro.constructors.PrimitiveConstructorSpec(
@@ -85,32 +61,16 @@ Numbers = Annotated[
         str_from_instance=lambda value: [str(number) for number in value or ()],
     ),
 ]
-RANGES = {  # lowest and highest value of every numeric flag; NaN and infinity are out of range
-    **dict.fromkeys(["seed", "eval_seed", "eval_every"], (0, 2**31 - 1)),
-    "num_threads": (0, 256),
-    **dict.fromkeys(["total_updates", "num_envs", "num_minibatches", "update_epochs"], (1, 10**6)),
-    **dict.fromkeys(["embed_dim", "num_heads", "mlp_dim", "hidden_dim"], (1, 8192)),
-    **dict.fromkeys(["learning_rate", "clip_coef", "gamma", "gae_lambda", "memory_noise"], (0.0, 1.0)),
-    **dict.fromkeys(["ent_coef", "vf_coef", "mass_weight", "fuel_weight", "slope_weight"], (0.0, 1e3)),
-    **dict.fromkeys(["reward_scale", "max_grad_norm", "target_kl"], (1e-9, 1e9)),
-    **{"log_std": (-8.0, 0.5), "log_radius": (-5.0, 14.0)},
-    **{"eval_starts": (10, 10**6), "num_blocks": (0, 64), "memory_length": (0, 8192)},
-    **{"flights_per_start": (1, 10**6), "dispersion": (0.0, 10.0), "weight_average": (0.0, 0.99999)},
-    **{"failure_probability": (0.0, 1.0), "decision_s": (0.2, 10.0), "longest_flight": (1.0, 1000.0)},
-    **dict.fromkeys(["failure_size", "training_failure_size"], (1.0, 100.0)),
-    **{"failure_emphasis": (0.0, 10.0), "failed_fuel_share": (0.0, 1.0)},
-    **{"thrust_share": (0.2, 1.0), "start_spread": (0.0, 2.0), "wind": (0.0, 10.0), "action_hold": (1.0, 500.0)},
-    "failure": (0.0, 0.3),
-}
+WORDS_OF_SCHEDULES = tyro.constructors.PrimitiveConstructorSpec(
+    nargs="*",
+    metavar="VALUE | PLACE:VALUE ...",
+    instance_from_str=lambda words: Schedule(" ".join(words)),
+    is_instance=lambda value: isinstance(value, Schedule),
+    str_from_instance=lambda value: str(value).split(),
+)
+REGISTRY = tyro.constructors.ConstructorRegistry()
+REGISTRY.primitive_rule(lambda flag: WORDS_OF_SCHEDULES if flag.type is Schedule else None)
 ROOT = Path(__file__).resolve().parent
-RECIPE_WORDS = ("ours", "paper")
-NETWORK = ("num_blocks", "embed_dim", "num_heads", "memory_length", "mlp_dim", "hidden_dim")
-# environment options that every run and evaluation chooses anew
-NOT_OF_A_CHECKPOINT = {"dispersion", "failure", "navigation_noise"}
-# environment options that a checkpoint decides unless they are typed
-MAY_DIFFER_FROM_A_CHECKPOINT = {"failure_probability", "failure_size", "failure_time"}
-CHANGED_BY_TRAINING = {"differences"}  # constants of an agent that a training may set anew
-MAY_CHANGE_ON_RESUME = {"resume", "cuda", "num_threads"}
 
 
 def fail(message) -> NoReturn:
@@ -118,67 +78,42 @@ def fail(message) -> NoReturn:
     sys.exit(f"error: {' '.join(str(message).split())}")
 
 
+def flag_of(name, value):
+    """An Args field and its value as they are typed."""
+    return f"--{name.replace('_', '-')} {value}".strip()
+
+
 def refuse(name, value, allowed) -> NoReturn:
     """End with one line that names the flag of an Args field, its value and what is allowed."""
-    flag = f"--{name.replace('_', '-')} {value}".strip()
-    fail(f"{flag}: {allowed}")
+    fail(f"{flag_of(name, value)}: {allowed}")
 
 
-def read_flags(defaults, argv):
-    """The dataclass that a command line describes, and the set of fields that it names. `defaults` has the others.
-
-    tyro knows which flags there are and what they take. It does not tell which flags were typed, so we read their names
-    from `argv`. It complains in a frame of several lines, so we show the frame's first paragraph as one line.
-    """
-    with contextlib.redirect_stderr(io.StringIO()) as frame:
-        try:
-            args = tyro.cli(type(defaults), args=argv, default=defaults, description=allowed(defaults))
-        except SystemExit as stop:
-            if not stop.code:  # --help
-                raise
-            lines = [line.strip("│ ") for line in frame.getvalue().splitlines() if line[:1] != "╭"]
-            first_paragraph = takewhile(lambda line: line[:1] not in ("─", "╰"), lines)
-            fail(f"{' '.join(first_paragraph)} (--help lists what is allowed)")
-    flags = [word.split("=")[0] for word in argv if word.startswith("--")]
-    names = [flag.removeprefix("--").replace("-", "_") for flag in flags]
-    return args, {name.removeprefix("no_") for name in names}
-
-
-def allowed(args):
-    """The line of --help that gives the range of each numeric flag."""
-    ranges = {name: bounds for name, bounds in RANGES.items() if hasattr(args, name)}
-    flags = (f"--{name.replace('_', '-')} {low:g} to {high:g}" for name, (low, high) in ranges.items())
-    return f"Ranges: {', '.join(flags)}"
-
-
-def parse_args(kind, recipe, argv, env_options, buffers):
+def parse_args(script, argv):
     """A script's checked arguments, and what it begins with: a saved training state, a checkpoint's contents or None.
 
-    - kind: the script's Args
-    - recipe: the function recipe(args) -> what the recipe changes for these environments
-    - env_options: names of the arguments that go to the environments
-    - buffers: {environment id: the buffers of its agents}
+    `script` is the module. It has:
+
+    - Args: the dataclass of the flags
+    - recipe(args): what the recipe changes for these environments
+    - ENV_IDS: the script's environments
+    - ENV_OPTIONS: names of the arguments that go to the environments
+    - constants(environment id): the buffers of the environment's agents
 
     A typed flag wins over a checkpoint, a checkpoint over the recipe, and the recipe over Args. Raises SystemExit with
     one line that names the flag, the value and what is allowed.
     """
     asks_for_help = not {"-h", "--help"}.isdisjoint(argv)
-    typed_args, typed = read_flags(kind(), [word for word in argv if word not in ("-h", "--help")])
-    env_ids = tuple(buffers)
-    if typed_args.resume is not None and not asks_for_help:
-        refused = sorted(typed - MAY_CHANGE_ON_RESUME)
-        if refused:
-            refuse(refused[0], "", "only --cuda and --num-threads may be given beside --resume")
-        saved = load_state(typed_args.resume, kind, env_ids)
-        args = kind(**{**saved["args"], **{name: getattr(typed_args, name) for name in typed}})
-        defaults = args
+    typed = read_flags(script.Args(), [word for word in argv if word not in ("-h", "--help")])
+    if typed.get("resume") is not None and not asks_for_help:
+        untyped, saved = resumed(typed, script)
     else:
-        defaults, saved = resolve(typed_args, typed, kind, recipe, env_options, buffers)
-        args, _ = read_flags(defaults, argv)
-    check(args, env_ids)
-    check_buffers(args, buffers[args.env_id])
+        untyped, saved = resolve(typed, script)
+    args = replace(untyped, **typed)
+    if asks_for_help:
+        read_flags(args, ["--help"])  # prints, and ends the script
+    check(args, script.ENV_IDS)
     task = task_of(args.env_id)
-    options = options_of(args, env_options)
+    options = options_of(args, script.ENV_OPTIONS)
     unfit = task.refusal(not args.eval_only, **options)
     if unfit:
         name, why = unfit
@@ -189,44 +124,91 @@ def parse_args(kind, recipe, argv, env_options, buffers):
         if remark:
             print(remark)
     if args.eval_starts is None:
-        is_cut_short = not args.eval_only and args.total_updates < defaults.total_updates
+        is_cut_short = not args.eval_only and args.total_updates < untyped.total_updates
         args.eval_starts = task.default_flights(is_cut_short, **options)
     return args, saved
 
 
-def resolve(args, typed, kind, recipe, env_options, buffers):
-    """Args as they are without the typed flags: the checkpoint's, then the recipe's; and what the checkpoint holds."""
+def read_flags(defaults, argv):
+    """{field: value} of the flags that a command line names. `defaults` is an Args, whose values --help shows.
+
+    tyro knows which flags there are and what they take. It does not tell which flags were typed, so we read their names
+    from `argv`. It complains in a frame of several lines, so we show the frame's first paragraph as one line.
+    """
+    with contextlib.redirect_stderr(io.StringIO()) as frame:
+        try:
+            with REGISTRY:
+                args = tyro.cli(type(defaults), args=argv, default=defaults, description=allowed(type(defaults)))
+        except SystemExit as stop:
+            if not stop.code:  # --help
+                raise
+            lines = [line.strip("│ ") for line in frame.getvalue().splitlines() if line[:1] != "╭"]
+            first_paragraph = takewhile(lambda line: line[:1] not in ("─", "╰"), lines)
+            fail(f"{' '.join(first_paragraph).removeprefix('Error parsing ')} (--help lists what is allowed)")
+    flags = [word.split("=")[0] for word in argv if word.startswith("--")]
+    names = {flag.removeprefix("--").replace("-", "_").removeprefix("no_") for flag in flags}
+    return {name: getattr(args, name) for name in names & vars(args).keys()}  # "--" alone names none
+
+
+def allowed(kind):
+    """The lines of --help that give the ranges of the numeric flags."""
+    flags = {}
+    for name, (low, high) in facts(kind, Range).items():
+        flags.setdefault(f"{low:g} to {high:g}", []).append(flag_of(name, ""))
+    return "Ranges. " + ". ".join(f"{bounds}: {', '.join(names)}" for bounds, names in flags.items())
+
+
+def resumed(typed, script):
+    """The Args of the run that --resume goes on with, and its training state."""
+    refused = sorted(typed.keys() - {"resume", "cuda", "num_threads"})
+    if refused:
+        refuse(refused[0], "", "only --cuda and --num-threads may be given beside --resume")
+    saved = load_state(typed["resume"], script)
+    return script.Args(**saved["args"]), saved
+
+
+def resolve(typed, script):
+    """Args as they are without the typed flags, and what the checkpoint holds, or None.
+
+    The checkpoint is the one that is typed, or else the one with which the recipe begins.
+    """
     saved = None
-    decided = {}
-    if args.checkpoint is not None:
-        saved, decided = take_checkpoint_args(args, kind, typed, env_options, buffers)
-    elif args.eval_only:
+    of_policy = {}
+    check_env_id(typed.get("env_id", script.Args.env_id), script.ENV_IDS)
+    if typed.get("checkpoint") is not None:
+        saved, of_policy = read_policy(typed["checkpoint"], script)
+        refuse_contradictions(typed, of_policy, script)
+    elif typed.get("eval_only"):
         refuse("checkpoint", None, "must name the agent.safetensors that --eval-only flies")
-    check_values(args, tuple(buffers))
-    changes = recipe(args) if args.recipe == "ours" else {}
-    if args.checkpoint is None and "checkpoint" in changes:
-        first = changes["checkpoint"]
-        if not Path(first).is_file():
-            first = str(Path(__file__).parent / first)
-        if not Path(first).is_file():
-            fail(
-                f"the recipe begins with the policy {first}, which is not there: train it first, or name a --checkpoint"
-            )
-        _, its_own = read_policy(first, kind, env_options, buffers)
-        differing = contradictions(args, typed, its_own)
+    args = script.Args(**{**of_policy, **typed})
+    check_values(args, script.ENV_IDS)
+
+    of_recipe = dict(script.recipe(args)) if args.recipe == "ours" else {}
+    if saved is None and "checkpoint" in of_recipe:
+        first = of_recipe["checkpoint"] = path_of_policy(of_recipe["checkpoint"])
+        first_saved, of_first = read_policy(first, script)
+        differing = contradictions(typed, of_first, script.Args)
         if differing:
-            flag = f"--{differing[0].replace('_', '-')} {getattr(args, differing[0])}"
-            print(f"{flag}: the recipe's first policy, {first}, has another")
-            changes = recipe(replace(args, checkpoint=""))  # "": there is no policy to begin with
+            name = differing[0]
+            print(f"{flag_of(name, typed[name])}: the recipe's first policy, {first}, has another")
+            of_recipe = script.recipe(args, anew=True)
         else:
-            args.checkpoint = first
-            saved, decided = take_checkpoint_args(args, kind, typed, env_options, buffers)
-    return replace(kind(), **{**changes, **decided, "checkpoint": args.checkpoint}), saved
+            saved, of_policy = first_saved, of_first
+    if saved is not None:
+        saved["keeps_log_std"] = "log_std" not in typed  # a learned log-std goes on from the file's
+    return script.Args(**{**of_recipe, **of_policy}), saved
 
 
-def observation_scale(env_id):
-    """The buffer by which `features` divides observations, from the environment."""
-    return {"observation_scale": make_batch(env_id, 1).observation_scale.tolist()}
+def path_of_policy(path):
+    """The path of the policy with which a recipe begins: here, or beside the scripts.
+
+    Ends with one line if it is missing.
+    """
+    found = [place for place in (Path(path), ROOT / path) if place.is_file()]
+    if not found:
+        todo = "train it first, or name a --checkpoint"
+        fail(f"the recipe begins with the policy {ROOT / path}, which is not there: {todo}")
+    return str(found[0])
 
 
 def options_of(args, env_options):
@@ -234,89 +216,47 @@ def options_of(args, env_options):
     return {name: getattr(args, name) for name in env_options}
 
 
-def read_policy(path, kind, env_options, buffers):
-    """What an agent.safetensors holds, and the arguments that it decides.
+def younger(script):
+    """The arguments that an older file need not have: options of environments, and flags that are off with None.
+
+    Their defaults are what was trained before the flags existed.
+    """
+    return {
+        name: value for name, value in plain_args(script.Args()).items() if value is None or name in script.ENV_OPTIONS
+    }
+
+
+def read_policy(path, script):
+    """What an agent.safetensors holds, and the arguments {name: value} that it decides.
 
     Raises BadInput if the file is damaged or of another script.
     """
-    options = [name for name in env_options if name not in NOT_OF_A_CHECKPOINT]
-    names = ("env_id", *options, *NETWORK)
-    hints = get_type_hints(kind)
-    kinds = {name: hints[name] for name in names}
-    younger = {name: getattr(kind, name) for name in options}  # options that an older file does not have
-    saved = read_checkpoint(path, kinds, tuple(buffers), younger)
+    names = ["env_id", *facts(script.Args, Policy)]
+    kinds = get_type_hints(script.Args)
+    saved = read_checkpoint(path, {name: kinds[name] for name in names}, script.ENV_IDS, younger(script))
     return saved, {name: saved["args"][name] for name in names}
 
 
-def contradictions(args, typed, decided):
-    """The typed fields that differ from what a checkpoint decides."""
-    fixed = {name: value for name, value in decided.items() if name not in MAY_DIFFER_FROM_A_CHECKPOINT}
-    return [name for name, value in fixed.items() if name in typed and getattr(args, name) != value]
+def contradictions(typed, of_policy, kind):
+    """The typed fields that differ from what a policy's file fixes."""
+    marks = facts(kind, Policy)
+    fixed = ["env_id", *(name for name, mark in marks.items() if mark is Policy.FIXES)]
+    return [name for name in fixed if name in typed and typed[name] != of_policy[name]]
 
 
-def take_checkpoint_args(args, kind, typed, env_options, buffers):
-    """What the file --checkpoint holds, and the arguments that it decides.
+def refuse_contradictions(typed, of_policy, script):
+    """Refuse typed flags that do not fit the policy of --checkpoint.
 
-    Sets these arguments, and refuses flags that contradict them. --env-id may name another environment with the same
-    buffers. A learned log-std goes on from the file's, unless --log-std is typed.
+    --env-id may name another environment whose agents have the same constants.
     """
-    saved, decided = read_policy(args.checkpoint, kind, env_options, buffers)
-    for name in contradictions(args, typed, decided):
-        value = decided[name]
-        given = getattr(args, name)
-        if name == "env_id" and buffers.get(value) == buffers.get(given):
-            print(f"--checkpoint is of {value}; it goes on with {given}")
-            decided[name] = given
-        elif name == "env_id":
-            refuse(name, given, f"the checkpoint has {value}, whose policy does not fit")
-        else:
-            refuse(name, given, f"the checkpoint has {value}; leave the flag out")
-    decided |= {name: getattr(args, name) for name in MAY_DIFFER_FROM_A_CHECKPOINT & typed}
-    for name, value in decided.items():
-        setattr(args, name, value)
-    saved["keeps_log_std"] = "log_std" not in typed
-    return saved, decided
-
-
-def check_values(args, env_ids):
-    """Refuse a number that is out of its range, and a word that its flag does not take."""
-    check_env_id(args, env_ids)
-    choices = {"recipe": RECIPE_WORDS}
-    if args.env_id in known_ids():  # `check_buffers` refuses an unknown id
-        choices |= task_of(args.env_id).choices()
-    for name, words in choices.items():
-        check_word(args, name, words)
-    kinds = get_type_hints(type(args), include_extras=True)
-    for name, value in vars(args).items():
-        if name not in RANGES or value is None:
-            continue
-        low, high = RANGES[name]
-        values = schedule_values(name, value) if kinds[name] == Schedule else [value]
-        if not all(low <= number <= high for number in values):
-            refuse(name, value, f"must be between {low} and {high}")
-    if not all(number.is_integer() for number in schedule_values("flights_per_start", args.flights_per_start)):
-        refuse("flights_per_start", args.flights_per_start, "must be whole numbers")
-
-
-def check_env_id(args, env_ids):
-    """Refuse an --env-id that the script does not have, and name the script that trains it if there is one."""
-    if args.env_id in env_ids:
-        return
-    others = "".join(f"; {name}.py trains {args.env_id}" for name in scripts_with(args.env_id))
-    refuse("env_id", args.env_id, f"must be one of {', '.join(env_ids)}{others}")
-
-
-def scripts_with(env_id):
-    """The names of the scripts that have this environment."""
-    names = sorted(path.stem for path in ROOT.glob("ppo_gtrxl_*.py"))
-    return [name for name in names if env_id in importlib.import_module(name).ENV_IDS]
-
-
-def check_word(args, name, words):
-    """Refuse a flag whose value is none of `words`. A flag that the script does not have is not checked."""
-    value = getattr(args, name, words[0])
-    if value not in words:
-        refuse(name, value, f"must be one of {', '.join(words)}")
+    for name in contradictions(typed, of_policy, script.Args):
+        given = typed[name]
+        in_file = of_policy[name]
+        if name != "env_id":
+            refuse(name, given, f"the checkpoint has {in_file}; leave the flag out")
+        if script.constants(given) != script.constants(in_file):
+            refuse(name, given, f"the checkpoint has {in_file}, whose policy does not fit")
+        print(f"--checkpoint is of {in_file}; it goes on with {given}")
 
 
 def check(args, env_ids):
@@ -335,33 +275,34 @@ def check(args, env_ids):
         refuse("track", "", "needs wandb: pip install wandb")
 
 
-def schedule_values(name, schedule):
-    """The numbers that a schedule goes through. Ends with one line if it is no schedule."""
-    if not isinstance(schedule, str):
-        return [float(schedule)]
-    return schedule_points(name, schedule)[1]
+def check_values(args, env_ids):
+    """Refuse a number that is out of its range, and a word that its flag does not take."""
+    check_env_id(args.env_id, env_ids)
+    for name, (words,) in facts(type(args), Words).items():
+        value = getattr(args, name)
+        if value not in words:
+            refuse(name, value, f"must be one of {', '.join(words)}")
+    for name, (low, high) in facts(type(args), Range).items():
+        value = getattr(args, name)
+        numbers = value.values if isinstance(value, Schedule) else [value]
+        if value is not None and not all(low <= number <= high for number in numbers):
+            refuse(name, value, f"must be between {low} and {high}")
+    if not all(number.is_integer() for number in args.flights_per_start.values):
+        refuse("flights_per_start", args.flights_per_start, "must be whole numbers")
 
 
-def schedule_points(name, schedule):
-    """The places and the values of a schedule's points. Ends with one line if it is no schedule."""
-    try:
-        points = [[float(word) for word in point.split(":")] for point in schedule.split()]
-        places, values = zip(*points, strict=True)
-        if len(points[0]) != 2 or list(places) != sorted(places) or not all(0 <= place <= 1 for place in places):
-            raise ValueError
-    except ValueError:
-        refuse(name, schedule, "must be a number, or points as 0:-1 0.4:-2 1:-6 whose places rise from 0 to 1")
-    return places, values
+def check_env_id(env_id, env_ids):
+    """Refuse an --env-id that the script does not have, and name the script that trains it if there is one."""
+    if env_id in env_ids:
+        return
+    others = "".join(f"; {name}.py trains {env_id}" for name in scripts_with(env_id))
+    refuse("env_id", env_id, f"must be one of {', '.join(env_ids)}{others}")
 
 
-def group_sizes(args):
-    """The sizes of the groups of all updates, as `set_curriculum` of the scripts rounds them."""
-    schedule = args.flights_per_start
-    if not isinstance(schedule, str):
-        return {round(schedule)}
-    places, values = schedule_points("flights_per_start", schedule)
-    in_updates = np.interp(np.linspace(0, 1, args.total_updates), places, values)
-    return {round(size) for size in in_updates} | {round(value) for value in values}
+def scripts_with(env_id):
+    """The names of the scripts that have this environment."""
+    names = sorted(path.stem for path in ROOT.glob("ppo_gtrxl_*.py"))
+    return [name for name in names if env_id in importlib.import_module(name).ENV_IDS]
 
 
 def check_outputs(args):
@@ -379,28 +320,6 @@ def check_outputs(args):
         if path in taken:
             refuse(name, value, "must be a file of its own; another flag names it, too")
         taken.add(path)
-
-
-def check_buffers(args, buffers):
-    """Refuse BUFFERS whose scale does not fit the observations, and an id that no environment has.
-
-    buffers are those of --env-id. `observation_scale` has to hold one number for each observation. Other buffers are
-    not checked.
-    """
-    try:
-        spec = gym.spec(args.env_id)
-    except gym.error.Error:
-        refuse("env_id", args.env_id, "no environment of this id is registered; envs.PROBLEMS must have it")
-    scale = buffers.get("observation_scale")
-    if scale is None:
-        return
-    where = f"BUFFERS of {type(args)().exp_name}.py: observation_scale of {args.env_id}"
-    inputs = gym.spaces.flatdim(gym.make_vec(spec, num_envs=1).single_observation_space)
-    if len(scale) != inputs:
-        allowed = f"must hold {inputs} numbers, one for each of its observations"
-        fail(f"{where} holds {len(scale)}; {allowed}")
-    if not all(math.isfinite(number) and number for number in scale):
-        fail(f"{where} is {scale}; must be finite, without 0")
 
 
 def check_share(args, typed):
@@ -425,18 +344,16 @@ def check_share(args, typed):
         args.num_minibatches = smallest
 
     shares = {smallest, largest}
-    for group in group_sizes(args):
+    schedule = args.flights_per_start
+    for group in {round(size) for size in [*schedule.over(args.total_updates), *schedule.values]}:
         fits = largest_group(group, shares)
         if fits == group:
             continue
         if "flights_per_start" in typed:
-            in_one = f"; it is {group} in one update" if isinstance(args.flights_per_start, str) else ""
-            refuse("flights_per_start", args.flights_per_start, f"must divide {total_envs}{in_one}")
+            in_one = f"; it is {group} in one update" if schedule.has_points else ""
+            refuse("flights_per_start", schedule, f"must divide {total_envs}{in_one}")
         print(f"--flights-per-start lowered from {group} to {fits}, which divides {total_envs}")
-        if isinstance(args.flights_per_start, str):
-            args.flights_per_start = re.sub(rf":{group}\b", f":{fits}", args.flights_per_start)
-        else:
-            args.flights_per_start = fits
+        args.flights_per_start = args.flights_per_start.replaced(group, fits)
 
 
 def largest_group(most, shares):
@@ -509,7 +426,7 @@ def load_checkpoint(agent, args, saved):
         here = expected.get(name, "missing")
         why = f"{name} is {in_file} in the file and {here} in this script"
         todo = "train it anew, or fly it by the version that trained it (CHANGELOG.md)"
-        fail(f"--checkpoint {args.checkpoint}: does not fit its own args, BUFFERS or features ({why}); {todo}")
+        fail(f"--checkpoint {args.checkpoint}: does not fit its own args, constants or features ({why}); {todo}")
     for name, constant in constants_of(agent).items():
         if not torch.allclose(constant.cpu(), torch.from_numpy(saved["tensors"][name]), rtol=1e-6):
             print(f"--checkpoint {args.checkpoint}: {args.env_id} has another {name} now; the policy keeps its own")
@@ -519,18 +436,26 @@ def load_checkpoint(agent, args, saved):
     except (RuntimeError, TypeError) as error:  # the file can have a number type that torch does not have
         fail(f"--checkpoint {args.checkpoint}: its weights do not fit its own args ({error})")
     if agent.actor_logstd.requires_grad and not saved["keeps_log_std"]:
-        torch.nn.init.constant_(agent.actor_logstd, float(args.log_std))
+        torch.nn.init.constant_(agent.actor_logstd, args.log_std.at(0.0))
     if not args.eval_only:
         digest = hashlib.sha256(Path(args.checkpoint).read_bytes()).hexdigest()
         print(f"begins with {args.checkpoint}, sha256 {digest}")
 
 
-def constants_of(agent):
-    """{name: buffer} of a new agent, without the buffers that a training changes or fills.
+def observation_scale(env_id):
+    """A usual size of each observation of an environment. Raises BadInput if it does not fit the observations."""
+    envs = make_batch(env_id, 1)
+    scale = envs.observation_scale.tolist()
+    inputs = gym.spaces.flatdim(envs.single_observation_space)
+    fits = len(scale) == inputs and all(math.isfinite(size) and size for size in scale)
+    allowed = f"must hold {inputs} finite numbers other than 0, one for each of its observations"
+    refuse_unless(fits, f"observation_scale of {env_id}", scale, allowed)
+    return scale
 
-    A buffer that a training fills is zero in a new agent.
-    """
-    return {name: x for name, x in agent.named_buffers() if x.any() and name not in CHANGED_BY_TRAINING}
+
+def constants_of(agent):
+    """{name: buffer} of an agent, without the two of a rocket's that a training sets anew."""
+    return {name: x for name, x in agent.named_buffers() if name not in ("differences", "nominal_flight")}
 
 
 def finite(values, epoch, minibatch):
@@ -612,7 +537,7 @@ class Run:
         print(f"run folder: {self.folder}", flush=True)
         for leftover in self.folder.glob(".*.tmp"):  # a killed writer leaves such a file
             leftover.unlink()
-        arguments = {**asdict(self.args), "resume": None}
+        arguments = {**plain_args(self.args), "resume": None}
         if self.args.save_model:
             files.write_json(self.folder / "args.json", arguments)
         self.writer = new_writer(self.folder, self.progress["global_step"] + 1, arguments)
@@ -655,11 +580,12 @@ class Run:
     def end_update(self, iteration, alive, episodes, losses, learning_rate):
         """Count and log an update. Save every ten updates, evaluate every --eval-every, and print a line now and then.
 
-        alive (T, N) is the batch's. episodes is the `final_info` of all processes. losses are means over the update.
+        alive (T, N) is the batch's, episodes the `final_info` of its flights. losses are means over the update.
         """
         args = self.args
         now = time.time()
-        steps = int(all_reduce_sum(alive.sum()))
+        steps = int(total(alive.sum()))
+        episodes = gathered(episodes)
         self.progress = {**self.progress, "total_updates": iteration, "wall_seconds": now - self.began}
         self.progress["global_step"] += steps
         self.progress["training_seconds"] += now - self.update_began
@@ -775,7 +701,7 @@ def track(args, name):
 
     names = {"project": args.wandb_project_name, "entity": args.wandb_entity, "name": name, "id": name}
     try:
-        wandb.init(**names, resume="allow", sync_tensorboard=True, config=asdict(args), save_code=True)
+        wandb.init(**names, resume="allow", sync_tensorboard=True, config=plain_args(args), save_code=True)
     except Exception as error:  # wandb's errors (no login, no network, no such entity) have no common class
         fail(f"--track: Weights and Biases refuses the run ({error}); `wandb login` first, or leave --track out")
 
@@ -791,7 +717,7 @@ def training_state(args, modules, envs, progress):
     rng = {"torch": torch.get_rng_state()}
     rng |= {name: json.dumps(stream.bit_generator.state) for name, stream in envs.generators.items()}
     rng = all_gather({**rng, "cuda": torch.cuda.get_rng_state_all()})
-    return copy.deepcopy({"args": {**asdict(args), "resume": None}, "progress": progress, "rng": rng, **modules})
+    return copy.deepcopy({"args": {**plain_args(args), "resume": None}, "progress": progress, "rng": rng, **modules})
 
 
 def restore(state, run_dir, modules, envs):
@@ -818,8 +744,8 @@ def restore(state, run_dir, modules, envs):
         fail(f"--resume {run_dir}: its training_state.pt does not fit ({error}); {allowed}")
 
 
-def load_state(run_dir, kind, env_ids):
-    """The training state of a run folder. kind is the script's Args, env_ids are its environments.
+def load_state(run_dir, script):
+    """The training state of a run folder.
 
     Ends with one line if the state is missing, damaged or of another script.
     """
@@ -829,20 +755,18 @@ def load_state(run_dir, kind, env_ids):
         if damaged:
             raise ValueError(f"{damaged} is damaged")
         state = torch.load(path, map_location="cpu", weights_only=True)
-        # a flag that is newer than this run changes nothing if its default is None; any other is refused below
-        newer = {name: value for name, value in vars(kind()).items() if value is None}
-        args = {**newer, **state["args"]}
-        state["args"] = args
-        kinds = get_type_hints(kind)
-        if args["env_id"] not in env_ids:
-            raise ValueError(f"it is of {args['env_id']}; this script takes {', '.join(env_ids)}")
+        args = state["args"] = {**younger(script), **state["args"]}
+        kinds = get_type_hints(script.Args)
+        if args["env_id"] not in script.ENV_IDS:
+            raise ValueError(f"it is of {args['env_id']}; this script takes {', '.join(script.ENV_IDS)}")
         if args.keys() != kinds.keys():
             raise ValueError(f"{min(args.keys() ^ kinds.keys())} is not among the arguments of both")
-        wrong = [name for name in kinds if not isinstance(args[name], kinds[name])]
+        values = vars(script.Args(**args))
+        wrong = [name for name in kinds if not isinstance(values[name], kinds[name])]
         if wrong:
             raise ValueError(f"{wrong[0]} is {args[wrong[0]]!r}")
     except Exception as error:  # a missing or damaged file fails in many ways, which are all the same to the user
-        fail(f"--resume {run_dir}: must hold a training_state.pt of {kind().exp_name}.py ({error})")
+        fail(f"--resume {run_dir}: must hold a training_state.pt of {script.Args.exp_name}.py ({error})")
     return state
 
 
@@ -905,6 +829,12 @@ def all_gather(value):
     return values
 
 
+def gathered(episodes):
+    """The `final_info` {key: (N, ...)} of the flights of all processes, in the order of their ranks."""
+    of_each_process = all_gather(episodes)
+    return {key: np.concatenate([part[key] for part in of_each_process]) for key in episodes}
+
+
 def local_shard(values, count):
     """This process's part of `values`, which hold `count` values for each process in the order of their ranks."""
     rank, _ = rank_and_world_size()
@@ -912,19 +842,17 @@ def local_shard(values, count):
     return values[begin : begin + count]
 
 
-def sum_gradients(agent):
-    """Sum the gradients over all processes, in place. One buffer holds them all, because each exchange takes time."""
+def total(x):
+    """The sum over all processes of a tensor, or of each tensor of a list, in place. In one process it is x itself.
+
+    One buffer holds all tensors of a list, because each exchange takes time.
+    """
     if not dist.is_initialized():
-        return
-    gradients = [parameter.grad for parameter in agent.parameters() if parameter.grad is not None]
-    flat = all_reduce_sum(torch.cat([gradient.flatten() for gradient in gradients]))
-    parts = flat.split([gradient.numel() for gradient in gradients])
-    for gradient, part in zip(gradients, parts):
-        gradient.copy_(part.view_as(gradient))
-
-
-def all_reduce_sum(x):
-    """The sum of a tensor over all processes, in place."""
-    if dist.is_initialized():
+        return x
+    if isinstance(x, torch.Tensor):
         dist.all_reduce(x)
+        return x
+    flat = total(torch.cat([tensor.flatten() for tensor in x]))
+    for tensor, part in zip(x, flat.split([tensor.numel() for tensor in x])):
+        tensor.copy_(part.view_as(tensor))
     return x

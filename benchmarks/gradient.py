@@ -26,7 +26,7 @@ import math
 import os
 import sys
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
 from typing import NamedTuple
@@ -47,6 +47,7 @@ from common.checkpoints import read_checkpoint
 from common.command_line import OneLineParser, integer, output_file
 from common.evaluations import read_json
 from common.files import write_bytes, write_json
+from common.flags import plain_args
 from common.flying import decision_us, fly_until_ended
 from common.integration import rk4
 from common.tasks import task_of
@@ -210,10 +211,20 @@ def fly(agent, env) -> Flown:
     return Flown(*columns, torch.tensor(last), bool(final["crashed"].any()))
 
 
-def directions(agent, physics: Physics, y, shown, cache, t):
-    """The policy's directions (..., 3) in ECI, in states y (..., 7) with the other observations `shown` (..., 3)."""
-    obs = torch.cat([y[..., :6], shown], dim=-1)
-    return physics.to_eci(agent.get_mean_action(agent.encode_step(obs, cache, t)), y)
+def directions(agent, physics: Physics, y, shown, memories: list):
+    """The policy's directions (..., 3) in ECI, in states y (..., 7) with the other observations `shown` (..., 3).
+
+    As `Agent.encode_step`, but nothing is written into a cache, which autograd could not follow. Each block's entry of
+    `memories` is replaced: the keys and values of the last L steps, and two constants (`start_memories`).
+    """
+    x = agent.encoder(ppo_gtrxl_rocket.features(agent, torch.cat([y[..., :6], shown], dim=-1)))
+    for k, block in enumerate(agent.blocks):
+        past, projections, R = memories[k]
+        q, kv = block.attention.project(x, projections)
+        window = torch.cat([past, kv], dim=3)
+        x = block(x, block.attention.attend(q, window, R))
+        memories[k] = window[:, :, :, 1:], projections, R
+    return physics.to_eci(agent.get_mean_action(x), y)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -237,9 +248,9 @@ def unrolled(agent, physics: Physics, flights: Flown):
     T, n = flights.y.shape[:2]
     states = [flights.y[0]]
     flown = []
-    cache = empty_cache(agent, n)
+    memories = start_memories(agent, n)
     for t in range(T):
-        flown.append(directions(agent, physics, states[t], flights.shown[t], cache, t))
+        flown.append(directions(agent, physics, states[t], flights.shown[t], memories))
         states.append(physics.advance(np.array([t]), states[t][None], flown[t][None])[0])
     ends = flights.last, torch.arange(n)
     outcome = physics.outcome(flights.last, torch.stack(states)[ends], torch.stack(flown)[ends])
@@ -252,29 +263,10 @@ def all_rows(outputs, weights: list, rows):
     return torch.cat([part.flatten(start_dim=1) for part in parts], dim=1)
 
 
-class Window:
-    """Keys and values of the last L + 1 steps, for `RelativeAttention.step`, which writes into its cache.
-
-    Autograd cannot follow writes into one cache. It can follow a new tensor for every step.
-    """
-
-    def __init__(self, kv):
-        self.kv, self.length = kv, kv.shape[3]
-
-    def __setitem__(self, place, value):
-        self.kv = torch.cat([self.kv[:, :, :, -self.length :], value], dim=3)
-
-    def __getitem__(self, place):
-        return self.kv
-
-
-def empty_cache(agent, n: int) -> list:
-    """The caches of `Agent.encode_step` at the begin of a flight."""
-    cache = []
-    for block, memory in zip(agent.blocks, agent.new_memory(n, noise=0.0)):
-        kv, projections, R = block.attention.start_cache(memory, 0)
-        cache.append((Window(kv), projections, R))
-    return cache
+def start_memories(agent, n: int) -> list:
+    """What `directions` remembers at the begin of a flight: a memory of zeros in each block."""
+    zeros = agent.new_memory(n, noise=0.0)
+    return [block.attention.start_cache(memory, 0) for block, memory in zip(agent.blocks, zeros)]
 
 
 def adjoint(agent, physics: Physics, flights: Flown):
@@ -290,7 +282,7 @@ def adjoint(agent, physics: Physics, flights: Flown):
     T, n = flights.y.shape[:2]
     y, u = flights.y.requires_grad_(), flights.u.requires_grad_()
     A, B = by_rows(physics.advance(np.arange(T), y, u), [y, u])
-    (K,) = by_rows(directions(agent, physics, y, flights.shown, [], 0), [y])
+    (K,) = by_rows(directions(agent, physics, y, flights.shown, []), [y])
     ends = flights.last, torch.arange(n)
     y_last = y.detach()[ends].requires_grad_()
     u_last = u.detach()[ends].requires_grad_()
@@ -305,7 +297,7 @@ def adjoint(agent, physics: Physics, flights: Flown):
 
     J, g = [], torch.stack(g)  # (T, n, 7, 3)
     for k in range(n):
-        of_flight = directions(agent, physics, y[:, k].detach(), flights.shown[:, k], [], 0)  # (T, 3)
+        of_flight = directions(agent, physics, y[:, k].detach(), flights.shown[:, k], [])  # (T, 3)
         J.append(all_rows(of_flight, weights_of(agent), g[:, k].transpose(0, 1)))
     return outcome.detach(), torch.stack(J)
 
@@ -492,8 +484,7 @@ def new_agent(row: Row, seed: int):
     """A script's agent, without blocks unless the row has a memory, and its arguments."""
     script = row.script
     args = row.script.Args(env_id=row.env_id, seed=seed)
-    for name, value in script.recipe(args).items():
-        setattr(args, name, value)
+    args = replace(args, **script.recipe(args))
     if not row.has_memory:
         args.num_blocks = 0
     torch.manual_seed(seed)
@@ -531,7 +522,7 @@ def policy_file(agent, args, curve: Curve, recipe: Recipe) -> bytes:
     seconds = 60 * curve.points[-1]["minutes"]
     counters = {"seed": args.seed, "total_updates": recipe.updates, "global_step": 0}
     counters |= {"training_seconds": seconds, "wall_seconds": seconds}
-    metadata = {"env_id": args.env_id, "args": json.dumps(asdict(args)), **counters}
+    metadata = {"env_id": args.env_id, "args": json.dumps(plain_args(args)), **counters}
     return safetensors.torch.save(agent.float().state_dict(), {key: str(value) for key, value in metadata.items()})
 
 

@@ -23,7 +23,13 @@ from common.evaluations import read_json
 from common.policies import evaluate_by_script, script_of
 from common.tasks import task_of
 
-NOT_OF_WEIGHTS = ("eval_seed", "eval_starts", *runs.NOT_OF_A_CHECKPOINT)  # what a file of weights does not decide
+NOT_OF_WEIGHTS = (
+    "eval_seed",
+    "eval_starts",
+    "dispersion",
+    "failure",
+    "navigation_noise",
+)  # what a file of weights does not decide
 
 
 def flags_of(args: dict) -> dict:

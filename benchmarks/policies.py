@@ -31,7 +31,7 @@ def load(checkpoint):
     script = script_of(env_id)
     refuse_unless(script, f"env_id of {checkpoint}", env_id, "must be one that a script trains")
     argv = ["--eval-only", "--checkpoint", str(checkpoint)]
-    args, saved = runs.parse_args(script.Args, script.recipe, argv, script.ENV_OPTIONS, script.BUFFERS)
+    args, saved = runs.parse_args(script, argv)
     args.dispersion = saved["args"].get("dispersion", 0.0)
     options = environment_options(script, args)
     agent = script.Agent(args, gym.make_vec(env_id, num_envs=1, **options))

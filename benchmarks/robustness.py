@@ -23,7 +23,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from dataclasses import fields, replace
+from dataclasses import fields
 from pathlib import Path
 from unittest import mock
 
@@ -172,7 +172,7 @@ def random_arguments(rng, script):
 
 def parse_args(script, argv):
     """The script's arguments and what it starts from."""
-    return runs.parse_args(script.Args, script.recipe, argv, script.ENV_OPTIONS, script.BUFFERS)
+    return runs.parse_args(script, argv)
 
 
 def fuzz_arguments(count, seed=0):
@@ -228,7 +228,7 @@ def hostile_state(rng, state):
 
 def parse_at_once(script, **flags):
     """`parse_args` of these flags without tyro, which takes ten times as long as the rest."""
-    with mock.patch.object(runs, "read_flags", lambda defaults, argv: (replace(defaults, **flags), set(flags))):
+    with mock.patch.object(runs, "read_flags", lambda defaults, argv: flags):
         return parse_args(script, [])
 
 

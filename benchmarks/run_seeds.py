@@ -24,13 +24,14 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import evaluate
 import runs
 from common.command_line import OneLineParser, integer
 from common.evaluations import read_json
+from common.flags import plain_args
 
 ROOT = Path(__file__).resolve().parents[1]
 SCRIPTS = sorted(path.name for path in ROOT.glob("ppo_gtrxl_*.py"))
@@ -143,10 +144,10 @@ def read_training(words):
     if {"--help", "-h"} & set(flags):
         raise ValueError("--help trains nothing")
     kind = importlib.import_module(Path(script).stem)
-    args, _ = runs.parse_args(kind.Args, kind.recipe, flags, kind.ENV_OPTIONS, kind.BUFFERS)
+    args, _ = runs.parse_args(kind, flags)
     if args.eval_only or not args.save_model:
         raise ValueError(f"{'--eval-only' if args.eval_only else '--no-save-model'} leaves no run to publish")
-    return Training(Path(results), [script, *flags], asdict(args))
+    return Training(Path(results), [script, *flags], plain_args(args))
 
 
 def publish(training, numbers):

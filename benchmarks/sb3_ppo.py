@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import json
 import time
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -31,11 +32,12 @@ import evaluate
 import ppo_gtrxl_di
 import ppo_gtrxl_rocket
 import ppo_gtrxl_vdp
-import runs
 from benchmarks.policies import environment_options, script_of
 from benchmarks.records import provenance
 from common.command_line import OneLineParser, integer
 from common.files import write_json
+from common.flags import Range, facts
+from common.schedule import Schedule
 from common.tasks import env_ids, task_of
 from sb3_env import NativeVecEnv
 
@@ -47,7 +49,7 @@ class OurFeatures(VecEnvWrapper):
     """Observations as our script's encoder sees them. `raw` are the environments' last observations (N, obs)."""
 
     def __init__(self, venv, script, env_id):
-        constants = {name: torch.tensor(value) for name, value in script.BUFFERS[env_id].items()}
+        constants = {name: torch.tensor(value) for name, value in script.constants(env_id).items()}
         self.script = script
         self.constants = SimpleNamespace(**constants)
         size = self(venv.observation_space.sample()[None]).shape[1]
@@ -68,7 +70,7 @@ class OurFeatures(VecEnvWrapper):
 
 
 class OurCurriculum(BaseCallback):
-    """Before each rollout, set what our script changes by the share of training done, and the price of propellant.
+    """Before each rollout, hand over what our script does by the share of training done, and a price of propellant.
 
     Our script compares the masses of flights that have all ended (`add_rewards`). This library's rollouts end in the
     middle of flights, so here propellant has a price by the kilogram. It is zero in the first quarter, highest at 60 %,
@@ -84,12 +86,13 @@ class OurCurriculum(BaseCallback):
 
     def _on_rollout_start(self):
         progress = self.num_timesteps / self.samples
-        self.args.log_std = self.model.policy.log_std.mean().item()  # as it was learned
-        self.script.set_curriculum(self.batch, self.args, progress)
+        self.args.log_std = Schedule(self.model.policy.log_std.mean().item())  # as it was learned
+        training = self.script.curriculum(self.args, progress)
         if hasattr(type(self.args), "mass_weight"):  # the rocket's script
             price = np.interp(progress, [0.25, 0.6, 1.0], [0.0, 1.0, 0.1])
-            self.batch.mass_weight = float(self.batch.cutoff * self.args.mass_weight * price)
-        self.batch.flights_per_start = 1  # the library compares no flights of one start
+            training["mass_weight"] = float(self.batch.cutoff * self.args.mass_weight.at(0.0) * price)
+        training["flights_per_start"] = 1  # the library compares no flights of one start
+        self.batch.hand_over(training)  # not at a reset, because its rollouts end in the middle of flights
 
     def _on_step(self):
         return True
@@ -199,7 +202,7 @@ def make_model(options, script, args, normalised, steps):
         batch_size=options.batch_size,
         n_epochs=options.epochs,
         gamma=options.gamma,
-        policy_kwargs={"net_arch": [64, 64], "log_std_init": args.log_std, **width},
+        policy_kwargs={"net_arch": [64, 64], "log_std_init": args.log_std.at(0.0), **width},
         seed=options.seed,
         device="cpu",
     )
@@ -240,13 +243,14 @@ def parse_args():
     )
     parser.add_argument("--json", type=Path, help="write the figures there")
     options = parser.parse_args()
+    script = script_of(options.env_id)
+    ranges = facts(script.Args, Range)
     for name, value in vars(options).items():
-        low, high = runs.RANGES.get(name, (None, None))
+        low, high = ranges.get(name, (None, None))
         if low is not None and value is not None and not low <= value <= high:
             parser.error(f"{flag(name)} {value}: must be between {low} and {high}")
     if options.seed == 0:
         parser.error("--seed 0: must be at least 1; the evaluation's starts are those of seed 0")
-    script = script_of(options.env_id)
     for name, without in (("dispersion", None), ("mass_weight", 3.0)):
         if getattr(options, name) != without and not hasattr(script.Args, name):
             parser.error(f"{flag(name)} {getattr(options, name)}: only a rocket has it, not {options.env_id}")
@@ -265,9 +269,10 @@ def main():
     torch.set_num_threads(1)
     script = script_of(options.env_id)
     args = script.Args(**{**script.recipe(script.Args(env_id=options.env_id)), "env_id": options.env_id})
-    args.log_std, args.flights_per_start = script.Args().log_std, 1  # the library learns its noise
-    given = {name: getattr(options, name) for name in ("dispersion", "mass_weight", "log_std")}
-    vars(args).update({name: value for name, value in given.items() if value is not None and hasattr(args, name)})
+    args = replace(args, log_std=script.Args.log_std, flights_per_start=1)  # the library learns its noise
+    asked = {name: getattr(options, name) for name in ("dispersion", "mass_weight", "log_std")}
+    given = {name: value for name, value in asked.items() if value is not None and hasattr(args, name)}
+    args = replace(args, **given)
     env_options = environment_options(script, args)
 
     batch = gym.make_vec(options.env_id, num_envs=options.num_envs, **env_options).unwrapped

@@ -184,7 +184,7 @@ class Bench:
 
     def flown(self):
         """The episodes of a rollout, with advantages of zero."""
-        batch, _ = self.script.rollout(self.agent, self.envs, self.args.reward_scale, 0.0)
+        batch, _ = self.script.rollout(self.agent, self.envs, {}, self.args.reward_scale, 0.0)
         batch.advantages = batch.targets = torch.zeros_like(batch.rewards)
         return batch
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import difflib
 import inspect
 from collections.abc import Callable
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import gymnasium as gym
@@ -15,32 +15,51 @@ from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from common.errors import BadInput, refuse_unless
+from common.errors import BadInput, is_finite, refuse_unless
 
 RENDERED = {"render_modes": ["rgb_array"], "render_fps": 15}
 AUTORESET_MODES = (AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP)
 
 
-class Sealed:
-    """An environment that refuses new public attributes, because a misspelt attribute would silently do nothing."""
+def numeric(default, low: float = 0.0, high: float = np.inf):
+    """A field of `Training` that is a finite number from low to high. If `default` is None, it may be None, too."""
 
-    _is_sealed = False
+    def fits(value):
+        if value is None:
+            return default is None
+        return is_finite(value) and low <= value <= high
 
-    def sealed(self):
-        """Seal this environment against new public attributes, and return it."""
-        self._is_sealed = True
-        return self
-
-    def __setattr__(self, name, value):
-        if self._is_sealed and not name.startswith("_") and not hasattr(self, name):
-            known = [other for other in dir(self) if not other.startswith("_")]
-            near = difflib.get_close_matches(name, known, n=1)
-            meant = f"; did you mean {near[0]!r}?" if near else ""
-            raise AttributeError(f"{type(self).__name__} has no attribute {name!r}{meant}")
-        super().__setattr__(name, value)
+    allowed = f"must be a number from {low:g} to {high:g}" if high < np.inf else f"must be a number of at least {low:g}"
+    return checked(default, fits, allowed)
 
 
-class BatchedEnv(Sealed, VectorEnv):
+def checked(default, fits: Callable, allowed: str):
+    """A field of `Training` for whose values `fits` is true. `allowed` says so in words."""
+    return field(default=default, metadata={"fits": fits, "allowed": allowed})
+
+
+def is_group(size) -> bool:
+    """Whether `size` is a number of flights."""
+    return isinstance(size, int | np.integer) and bool(size >= 1)
+
+
+@dataclass(frozen=True)
+class Training:
+    """What a training hands over to its environments, and no evaluation does. The defaults are what evaluations fly.
+
+    Raises BadInput for a value that cannot be.
+    """
+
+    flights_per_start: int = checked(1, is_group, "must be a whole number of at least 1")  # flights of each start
+
+    def __post_init__(self):
+        for each in fields(self):
+            value = getattr(self, each.name)
+            fits = each.metadata["fits"](value)
+            refuse_unless(fits, f"training's {each.name}", repr(value), each.metadata["allowed"])
+
+
+class BatchedEnv(VectorEnv):
     """The base of every problem's batch: step counters, checks of the action, and autoreset.
 
     With `autoreset_mode` "SameStep", the default, the step in which an episode ends returns the next episode's first
@@ -66,14 +85,19 @@ class BatchedEnv(Sealed, VectorEnv):
     the running steps begin (0); and `observation_scale`, a usual size of each observation (1), by which the networks of
     our scripts divide the observation.
 
-    Training may set `flights_per_start` G before a `reset`. Then environment k flies start k // G, so the flights of a
-    group differ only by their actions. With 1 each environment flies its own start. The last group is smaller if G does
-    not divide N. A dispersed rocket's start is its vehicle and air, and every second group has the draw of the group
-    before it with the signs changed (antithetic variates). This holds for the episodes that begin at a `reset`, and our
-    scripts train only on these. An autoreset groups the environments that ended in the same step, for any k.
+    `reset(options={"training": {name: value}})` hands over what only a training changes. The names are the fields of
+    `Training` or of the problem's own kind of it. The values stand in `self.training` and hold until the next `reset`.
+    A reset without them flies what evaluations fly.
+
+    With `flights_per_start` G environment k flies start k // G, so the flights of a group differ only by their actions.
+    With 1 each environment flies its own start. The last group is smaller if G does not divide N. A dispersed rocket's
+    start is its vehicle and air, and every second group has the draw of the group before it with the signs changed
+    (antithetic variates). This holds for the episodes that begin at a `reset`, and our scripts train only on these. An
+    autoreset groups the environments that ended in the same step, for any k.
     """
 
     metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
+    training = Training()  # a problem with a kind of its own has it here, with the values that evaluations fly
     single_observation_space: Box
     single_action_space: Box
     _start: Callable  # the problem's
@@ -110,9 +134,7 @@ class BatchedEnv(Sealed, VectorEnv):
         self.observation_space = batch_space(single_observation_space, num_envs)
         self.action_space = batch_space(single_action_space, num_envs)
         self.t = np.zeros(num_envs, dtype=np.int64)  # steps flown in the running episode
-        self.flights_per_start = 1
         self.observation_scale = np.ones(single_observation_space.shape)
-        self.has_circles = False  # True: `radius_scale` and `bonus_width` of the small problems can be set
         self._was_reset = False
 
     @property
@@ -133,10 +155,30 @@ class BatchedEnv(Sealed, VectorEnv):
     def reset(self, *, seed: int | None = None, options: dict | None = None):
         """Start every environment anew. Returns (N, obs) float64 and an empty info."""
         super().reset(seed=seed)
+        options = dict(options or {})
+        self.hand_over(options.pop("training", {}))
         self._restart(np.ones(self.num_envs, dtype=bool), options)
         self._waiting[:] = False
         self._was_reset = True
         return self._observe(), {}
+
+    def setting(self, name: str):
+        """What the training hands over by this name, or else this environment's attribute of the same name."""
+        handed_over = getattr(self.training, name)
+        return getattr(self, name) if handed_over is None else handed_over
+
+    def hand_over(self, training: dict):
+        """Take what a training hands over from here on. What it does not name is as in evaluations.
+
+        `reset` calls it. A learner that goes on without a reset, such as Stable-Baselines3's, calls it itself. Raises
+        BadInput for an unknown name or a bad value.
+        """
+        kind = type(self.training)
+        names = [each.name for each in fields(kind)]
+        refuse_unless(isinstance(training, dict), "options['training']", repr(training), "must be a dictionary")
+        for name, value in training.items():
+            refuse_unless(name in names, f"training's {name}", repr(value), f"must be one of {', '.join(names)}")
+        self.training = kind(**training)
 
     def step(self, actions):
         """Fly one step. Ended episodes restart in this step, or in the next one with `autoreset_mode` "NextStep"."""
@@ -217,9 +259,7 @@ class BatchedEnv(Sealed, VectorEnv):
 
         `draw(n)` draws n starts. At a `reset`, when all episodes begin, row k is that of environment k.
         """
-        group = self.flights_per_start
-        if not (isinstance(group, int | np.integer) and group >= 1):
-            raise ValueError(f"flights_per_start is {group!r}; it must be a whole number of at least 1")
+        group = self.training.flights_per_start
         return np.repeat(draw(-(-count // group)), group, axis=0)[:count]  # rounded up
 
     def _restart(self, mask, options):
@@ -246,7 +286,7 @@ def warn_of_no_mode(env):
     )
 
 
-class SingleEnv(Sealed, gym.Env):
+class SingleEnv(gym.Env):
     """One environment: a thin view of a batch of one (`batch`), without its autoreset.
 
     A step before a reset, or after an episode's end, raises `gymnasium.error.ResetNeeded`.
@@ -287,18 +327,6 @@ class SingleEnv(Sealed, gym.Env):
             return None
         frames = self.batch.render()
         return frames[0] if frames else None
-
-
-def of_batch(name: str, doc: str) -> property:
-    """A property of a single environment that reads and sets its batch's attribute."""
-
-    def read(env):
-        return getattr(env.batch, name)
-
-    def write(env, value):
-        setattr(env.batch, name, value)
-
-    return property(read, write, doc=doc)
 
 
 def check_options(environment: type, options: dict, *others: str):

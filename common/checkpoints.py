@@ -70,9 +70,9 @@ def read_checkpoint(
     return {"args": args, "progress": progress, "tensors": tensors}
 
 
-def types_of(kind: type | UnionType) -> tuple[type, ...]:
+def types_of(kind) -> tuple[type, ...]:
     """The types of which an annotation such as `float | None` consists."""
-    return get_args(kind) if isinstance(kind, UnionType) else (kind,)
+    return get_args(kind) or (kind,)
 
 
 def read_metadata(data: bytes) -> dict[str, str]:

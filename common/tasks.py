@@ -72,10 +72,6 @@ class Task(Protocol):
         """The line to print if the evaluation's seed is that of the training."""
         ...
 
-    def choices(self) -> dict[str, tuple[str, ...]]:
-        """{name: words} of the task's flags that take one of some words."""
-        ...
-
     def refusal(self, trains: bool, **env_options) -> tuple[str, str] | None:
         """A flag, such as `no_observe_phase`, that does not fit these options, and why. None if all fit."""
         ...
@@ -149,9 +145,6 @@ class SampledTask:
     def interim_flights(self, n: int, **env_options) -> int:
         return n
 
-    def choices(self) -> dict[str, tuple[str, ...]]:
-        return {}
-
     def remark_on_seed(self, eval_seed: int) -> str | None:
         return f"--eval-seed {eval_seed} is the training's --seed: it may have flown these starts"
 
@@ -169,24 +162,6 @@ def add_family(tables: Mapping[str, Any], make_task: str) -> None:
     `make_task` names the function that makes an id's task, as "module:function".
     """
     FAMILIES.append((tables, make_task))
-
-
-class ForEachId(Mapping):
-    """A mapping by environment id that makes a value when it is asked for."""
-
-    def __init__(self, env_ids, make: Callable[[str], Any]):
-        self.env_ids, self.make = tuple(env_ids), make
-
-    def __getitem__(self, env_id: str):
-        if env_id not in self.env_ids:
-            raise KeyError(env_id)
-        return self.make(env_id)
-
-    def __iter__(self):
-        return iter(self.env_ids)
-
-    def __len__(self) -> int:
-        return len(self.env_ids)
 
 
 def env_ids() -> list[str]:

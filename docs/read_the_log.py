@@ -140,7 +140,7 @@ PART_COLORS = ("tab:red", "tab:green", "tab:blue", "tab:orange", "black")
 def fly_shipped():
     """The flight of the shipped policy's mean action."""
     argv = ["--eval-only", "--checkpoint", str(ROOT / "results/rocket_cutoff/agent.safetensors")]
-    args, saved = runs.parse_args(script.Args, script.recipe, argv, script.ENV_OPTIONS, script.BUFFERS)
+    args, saved = runs.parse_args(script, argv)
     options = {name: getattr(args, name) for name in script.ENV_OPTIONS} | script.FIXED_OPTIONS
     batch = runs.make_envs(args, options)
     agent = script.Agent(args, batch)

@@ -2,8 +2,8 @@
 
     python -m exports.onnx_model ppo_gtrxl_rocket results/rocket_cutoff/agent.safetensors policy.onnx
 
-The script is loaded by its file's name. Its `features`, its agent and its weights are written to the model. Only one
-formula is written down again here: the attention of one step, with the memory as an input and an output.
+The script is loaded by its file's name. Its `features`, its agent and its weights are written to the model. The memory
+is an input and an output of each step.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from torch import nn
 
 from common.batch import make_batch
@@ -56,27 +55,14 @@ class PolicyStep(nn.Module):
     def forward(self, observation, memory=None):
         x = self.agent.encoder(self.features(self.in_float64, observation).float())
         next_memory = []
-        for k, (block, constants) in enumerate(zip(self.agent.blocks, self.constants)):
-            past = None if memory is None else memory[k]
-            attended, kept = attend(block.attention, x, past, *constants)
-            x = block(x, attended)
-            next_memory.append(kept)
+        for k, (block, (projections, R)) in enumerate(zip(self.agent.blocks, self.constants)):
+            q, window = block.attention.project(x, projections)
+            if memory is not None:
+                window = torch.cat([memory[k], window], dim=3)  # (2, N, H, L + 1, dk)
+            x = block(x, block.attention.attend(q, window, R))
+            next_memory.append(window[:, :, :, 1:])
         action = self.agent.get_mean_action(x)
         return action if memory is None else (action, torch.stack(next_memory))
-
-
-def attend(attention, x, past, projections, R):
-    """`RelativeAttention.step` of x (N, d) with the keys and values `past` (2, N, H, L, dk), or without any.
-
-    Returns MultiHead(x) (N, d), and the keys and values of the last L steps with this one.
-    """
-    qkv = F.linear(x, projections)  # (N, 3 d)
-    qkv = qkv.unflatten(-1, (3, attention.num_heads, 1, attention.dk)).transpose(0, 1)  # (3, N, H, 1, dk)
-    kv = qkv[1:] if past is None else torch.cat([past, qkv[1:]], dim=3)  # (2, N, H, L + 1, dk)
-    k, v = kv
-    scores = qkv[0] @ (k + R).transpose(-1, -2)  # (N, H, 1, L + 1)
-    attended = scores.softmax(dim=-1) @ v  # (N, H, 1, dk)
-    return attention.out(attended.flatten(1)), kv[:, :, :, 1:]
 
 
 # ---------------------------------------------------------------------------------------------------------------------

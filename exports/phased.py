@@ -28,7 +28,6 @@ def interface(
     observe_phase: bool = True,
     observe_velocity: bool = True,
     observe_draw: bool = False,
-    observe_command: bool = False,
     scaled_action: bool = False,
 ) -> Interface:
     """What a policy observes and commands, with these options of the environment."""
@@ -42,8 +41,6 @@ def interface(
     seen += clocks
     if observe_draw:
         seen += numbered("score", problem.scores)
-    if observe_command:
-        seen += [f"{name}_before" for name in controls]
     longest = problem.steps * problem.dt
     notes = f"Units are the table's. tau: time / {longest:g} s, at most 1. "
     if problem.waypoints:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
@@ -11,7 +12,7 @@ import numpy as np
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
 
-from common.batch import RENDERED, BatchedEnv, SingleEnv, check_options, of_batch, refuse_autoreset
+from common.batch import RENDERED, BatchedEnv, SingleEnv, Training, check_options, checked, numeric, refuse_autoreset
 from common.errors import BadInput, is_finite, refuse_unless
 from common.flying import fly_until_ended
 from landing.dynamics import Arc
@@ -29,8 +30,35 @@ from landing.rewards import (
 )
 
 PERIOD = 0.2  # s; a command is held for one or more periods, and a failure strikes at the begin of a period
+MULTIPLE = f"must be a multiple of {PERIOD} s"
 PUBLISHED_CHECKS = (0.05, 0.1, 0.15, 0.2)  # s within a period, when the published code looks at the altitude
 PUBLISHED_GROWTH = 500.0  # m by which the range may exceed its least value
+
+
+def is_multiple(seconds) -> bool:
+    """Whether `seconds` is one or more periods."""
+    return is_finite(seconds) and seconds > 0 and abs(seconds / PERIOD % 1 - 0.5) > 0.5 - 1e-6
+
+
+@dataclass(frozen=True)
+class LanderTraining(Training):
+    """What a training of a lander hands over. The defaults are the reported reward, starts and failures."""
+
+    position_scale: float = numeric(POSITION_SCALE, low=1e-12)  # m, scale of the position error in the terminal reward
+    speed_scale: float = numeric(SPEED_SCALE, low=1e-12)  # m/s, scale of the speed in it
+    sink_rate: float = numeric(0.0)  # m/s, the vertical speed at touchdown that the reward counts as none
+    fuel_price: float = numeric(FUEL_PRICE)  # reward lost for 100 kg of propellant
+    failed_fuel_share: float = numeric(1.0, high=1.0)  # share of it that flights with a failure pay
+    aloft_price: float = numeric(ALOFT_PRICE)  # reward lost where a flight ends in the air
+    slope_price: float = numeric(SLOPE_PRICE)  # weight of `slope_reward`
+    slope_height: float = numeric(SLOPE_HEIGHT)  # m, the height from which the slope is counted
+    thrust_share: float = numeric(1.0, high=1.0)  # share of the greatest thrust that a command may ask for
+    start_spread: float = numeric(1.0)  # factor on the width of the starts along x and y
+    wind: float = numeric(0.0)  # m/s^2, the amplitude of `sway`
+    # the environment's arguments of the same names, where they are not None
+    failure_probability: float | None = numeric(None, high=1.0)
+    failure_size: float | None = numeric(None, low=1.0)
+    decision_s: float | None = checked(None, lambda s: s is None or is_multiple(s), MULTIPLE)
 
 
 class LanderVectorEnv(BatchedEnv):
@@ -49,24 +77,18 @@ class LanderVectorEnv(BatchedEnv):
     `published_end` it ends as in the published code. That code looks at the altitude every 0.05 s, flies one step
     beyond the longest time, and stops a flight whose range exceeds its least value by 500 m.
 
-    Reward: -`fuel_price` for 100 kg burnt in the step. The last step adds `terminal_reward`. It also adds
-    `slope_reward` on the ground, or -`aloft_price` in the air. Only training changes these prices and scales, and
-
-    - `sink_rate` (m/s): the vertical speed at touchdown that counts as none
-    - `thrust_share`: the share of the greatest thrust that a command may ask for
-    - `start_spread`: a factor on the width of the starts along x and y
-    - `slope_height` (m): the height from which the slope is counted
-    - `failed_fuel_share`: the share of `fuel_price` that flights with a failure pay
-    - `wind` (m/s^2): the amplitude of `sway`
+    Reward: -`FUEL_PRICE` for 100 kg burnt in the step. The last step adds `terminal_reward`. It also adds
+    `slope_reward` on the ground, or -`ALOFT_PRICE` in the air (`rewards.py`). `LanderTraining` may change these prices.
 
     `final_info`: `episodic_return` (with the prices and scales of `rewards.py`), `position_error` (m), `speed` (m/s),
     `slope`, `down`, `landed`, `fuel_kg` and `final_time` (s), (N,) each, `final_y` (N, 7) and `draw` (N, 13).
 
     `reset(options={"draw": z})` sets the draws z (N, 13), numbers from 0 to 1 (`lander.DRAW`). `{"x0": x}` sets r and v
-    by x (N, 6). Raises BadInput for anything else.
+    by x (N, 6). `{"training": {...}}` hands over fields of `LanderTraining`. Raises BadInput for anything else.
     """
 
     metadata = {**BatchedEnv.metadata, **RENDERED}
+    training = LanderTraining()
 
     def __init__(
         self,
@@ -99,20 +121,14 @@ class LanderVectorEnv(BatchedEnv):
         possible = is_finite(self.longest_flight) and 0 < self.longest_flight <= lander.longest
         allowed = f"must be above 0 and at most the lander's, {lander.longest:g} s"
         refuse_unless(possible, "longest_flight", repr(longest_flight), allowed)
+        refuse_unless(is_multiple(decision_s), "decision_s", repr(decision_s), MULTIPLE)
         self.decision_s = decision_s
+        self._set_decision()
         action = Box(-1.0, 1.0, (3,), dtype=np.float64)
         super().__init__(num_envs, self.episode_steps, self._observation_space(), action, render_mode, autoreset_mode)
         self.observation_scale = np.array([1000.0] * 3 + [50.0] * 3 + [self.longest_flight] + [1.0] * 3)
         if observe_draw:
             self.observation_scale = np.append(self.observation_scale, np.ones(7))
-        self.position_scale = POSITION_SCALE
-        self.speed_scale = SPEED_SCALE
-        self.sink_rate = 0.0
-        self.fuel_price = FUEL_PRICE
-        self.aloft_price = ALOFT_PRICE
-        self.slope_price = SLOPE_PRICE
-        self.slope_height, self.failed_fuel_share = SLOPE_HEIGHT, 1.0
-        self.thrust_share, self.start_spread, self.wind = 1.0, 1.0, 0.0
         self.draw = np.zeros((num_envs, len(DRAW)))
         self.flights = self._drawn(self.draw)
         self.r = self.flights.r.copy()
@@ -131,21 +147,19 @@ class LanderVectorEnv(BatchedEnv):
         """Seconds between two decisions."""
         return self._hold * PERIOD
 
-    @property
-    def decision_s(self) -> float:
-        """Seconds between two decisions. It may be set before a `reset`."""
-        return self.dt
+    def hand_over(self, training: dict):
+        """As in `BatchedEnv`. Another `decision_s` changes the number of steps, too."""
+        super().hand_over(training)
+        self._set_decision()
 
-    @decision_s.setter
-    def decision_s(self, seconds: float):
-        is_multiple = is_finite(seconds) and seconds > 0 and abs(seconds / PERIOD % 1 - 0.5) > 0.5 - 1e-6
-        refuse_unless(is_multiple, "decision_s", repr(seconds), f"must be a multiple of {PERIOD} s")
-        self._hold = round(seconds / PERIOD)
+    def _set_decision(self):
+        """Set the periods between two decisions, and the number of steps."""
+        self._hold = round(self.setting("decision_s") / PERIOD)
         self.episode_steps = math.ceil(self.longest_flight / self.dt - 1e-9) + self.published_end
 
     def _drawn(self, draw) -> Flights:
-        failure = self.failure_probability, self.failure_size, self.failure_time
-        return draw_flights(self.lander, draw, *failure, self.start_spread)
+        failure = self.setting("failure_probability"), self.setting("failure_size"), self.failure_time
+        return draw_flights(self.lander, draw, *failure, self.training.start_spread)
 
     def _observation_space(self):
         """The box that holds every observation."""
@@ -210,7 +224,7 @@ class LanderVectorEnv(BatchedEnv):
         digits = self.draw * 1000 % 1
         turns = self.time / (10 + 20 * digits[:, 2])
         along_x, along_y = (np.sin(2 * np.pi * (turns + digits[:, axis])) for axis in (0, 1))
-        return self.wind * np.stack([along_x, along_y, np.zeros(self.num_envs)])
+        return self.training.wind * np.stack([along_x, along_y, np.zeros(self.num_envs)])
 
     def _observe(self):
         obs = np.empty((self.num_envs, self.single_observation_space.shape[0]))
@@ -227,17 +241,18 @@ class LanderVectorEnv(BatchedEnv):
     def _advance(self, actions):
         burnt = self.mass.copy()
         greatest = self.lander.greatest_thrust
-        command = greatest * limited(actions.T, self.lander.least_thrust / greatest, self.thrust_share)
+        handed = self.training
+        command = greatest * limited(actions.T, self.lander.least_thrust / greatest, handed.thrust_share)
         self.u[:] = command.T
         for _ in range(self._hold):
             self._fly(command)
         self.t += 1
-        price = self.fuel_price * np.where(np.isfinite(self.flights.strike), self.failed_fuel_share, 1.0)
+        price = handed.fuel_price * np.where(np.isfinite(self.flights.strike), handed.failed_fuel_share, 1.0)
         rewards = -price / 100 * (burnt - self.mass)
         if self._ended.any():
-            end = np.where(self.down, slope_reward(self.slope(), self.slope_price), -self.aloft_price)
-            speed_error = np.sqrt(self.v[0] ** 2 + self.v[1] ** 2 + (self.v[2] + self.sink_rate) ** 2)
-            end += terminal_reward(self.position_error(), speed_error, self.position_scale, self.speed_scale)
+            end = np.where(self.down, slope_reward(self.slope(), handed.slope_price), -handed.aloft_price)
+            speed_error = np.sqrt(self.v[0] ** 2 + self.v[1] ** 2 + (self.v[2] + handed.sink_rate) ** 2)
+            end += terminal_reward(self.position_error(), speed_error, handed.position_scale, handed.speed_scale)
             rewards = rewards + np.where(self._ended, end, 0.0)
         return rewards, self._ended.copy(), self._final_info
 
@@ -246,7 +261,7 @@ class LanderVectorEnv(BatchedEnv):
         lander = self.lander
         thrust = limited(command * self.effectiveness(), lander.least_thrust, lander.greatest_thrust)
         norm = np.sqrt((thrust * thrust).sum(axis=0))
-        gravity = self.flights.gravity + self.sway() if self.wind else self.flights.gravity
+        gravity = self.flights.gravity + self.sway() if self.training.wind else self.flights.gravity
         arc = Arc(self.r, self.v, self.mass, thrust / norm, norm / lander.exhaust, gravity)
         length = PERIOD
         r, v, mass = arc.after(PERIOD, lander)
@@ -269,7 +284,7 @@ class LanderVectorEnv(BatchedEnv):
             self._ticks += 1
         self.r, self.v, self.mass = r, v, mass
         self.time = self.time + length
-        is_high = r[2] > self.slope_height
+        is_high = r[2] > self.training.slope_height
         self._above = np.where(is_high, r, self._above)
         self.down = self.down | touches
         self._ended = self._ended | touches | self._is_over()
@@ -354,31 +369,19 @@ def published_touchdown(arc: Arc, lander: Lander):
 
 
 class LanderEnv(SingleEnv):
-    """One flight of `LanderVectorEnv`, with those of the batch's attributes that are named below."""
-
-    position_scale = of_batch("position_scale", "Scale (m) of the position error in the terminal reward.")
-    speed_scale = of_batch("speed_scale", "Scale (m/s) of the speed in the terminal reward.")
-    sink_rate = of_batch("sink_rate", "Vertical speed (m/s) at touchdown that the reward counts as none.")
-    fuel_price = of_batch("fuel_price", "Reward lost for 100 kg of propellant.")
-    aloft_price = of_batch("aloft_price", "Reward lost where a flight ends in the air.")
-    slope_price = of_batch("slope_price", "Weight of `slope_reward`.")
-    slope_height = of_batch("slope_height", "Height (m) from which the slope is counted.")
-    failed_fuel_share = of_batch("failed_fuel_share", "Share of `fuel_price` that flights with a failure pay.")
-    thrust_share = of_batch("thrust_share", "Share of the greatest thrust that a command may ask for.")
-    start_spread = of_batch("start_spread", "Factor on the width of the starts, along x and y.")
-    wind = of_batch("wind", "Amplitude (m/s^2) of an acceleration along x and y that comes and goes.")
+    """One flight of `LanderVectorEnv`."""
 
 
 def make_lander_vector(env_id: str, num_envs: int = 1, **options) -> LanderVectorEnv:
     """The batched environment of a lander in `LANDERS`. `gymnasium.make_vec` calls it."""
     check_options(LanderVectorEnv, options)
-    return LanderVectorEnv(LANDERS[env_id], num_envs, **options).sealed()
+    return LanderVectorEnv(LANDERS[env_id], num_envs, **options)
 
 
 def make_lander(env_id: str, **options) -> LanderEnv:
     """The single environment of a lander in `LANDERS`. `gymnasium.make` calls it."""
     refuse_autoreset(options)
-    return LanderEnv(make_lander_vector(env_id, **options)).sealed()
+    return LanderEnv(make_lander_vector(env_id, **options))
 
 
 make_lander.metadata = RENDERED  # gym.make looks here before there is an environment

@@ -10,7 +10,7 @@ from common.command_line import integer
 from common.errors import refuse_unless
 from landing.comparison import compare
 from landing.environment import fly_lander
-from landing.lander import FAILURE_TIMES, LANDERS, Lander
+from landing.lander import LANDERS, Lander
 from landing.metrics import FLIGHTS, KEPT_FLIGHTS, REFERENCE_STARTS, draws, evaluate_policy
 from landing.optimum import references
 from landing.report import report_lander
@@ -64,9 +64,6 @@ class LanderTask:
 
     def remark_on_seed(self, eval_seed: int) -> str | None:
         return None  # draws of an evaluation come from another stream
-
-    def choices(self) -> dict[str, tuple[str, ...]]:
-        return {"failure_time": FAILURE_TIMES}
 
     def refusal(self, trains: bool, **env_options) -> tuple[str, str] | None:
         return None

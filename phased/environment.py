@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
@@ -10,7 +11,7 @@ import numpy as np
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
 
-from common.batch import RENDERED, BatchedEnv, SingleEnv, check_options, of_batch, refuse_autoreset
+from common.batch import RENDERED, BatchedEnv, SingleEnv, Training, check_options, checked, numeric, refuse_autoreset
 from common.errors import BadInput, refuse_unless
 from common.flying import fly_until_ended
 from common.integration import falling_root
@@ -19,6 +20,25 @@ from phased.problem import LARGEST_SCORE, PROBLEMS, Phase, Problem
 # The observed target moves to the new waypoint over these first steps of a phase. The number is the paper's. That it
 # moves linearly is our choice.
 TRANSITION_STEPS = 5
+
+
+def are_scales(scales) -> bool:
+    """Whether `scales` are factors on radii, one number or one for each phase."""
+    try:
+        array = np.asarray(scales, dtype=np.float64)
+    except (TypeError, ValueError):
+        return False
+    return array.ndim <= 1 and bool((np.isfinite(array) & (array >= 0)).all())
+
+
+@dataclass(frozen=True)
+class PhasedTraining(Training):
+    """What a training of a small problem hands over. The defaults are the paper's reward."""
+
+    # factor on the radii in which the reward pays the bonus, one number or one for each phase
+    radius_scale: float = checked(1.0, are_scales, "must be numbers of at least 0, one or one for each phase")
+    # distance beyond these radii over which the bonus falls linearly to 0 (0: a step)
+    bonus_width: float = numeric(0.0)
 
 
 class PhasedVectorEnv(BatchedEnv):
@@ -49,20 +69,15 @@ class PhasedVectorEnv(BatchedEnv):
     - with scores `draw` (N, k)
 
     `observe_phase=False` shows tau and phi as 0, and `observe_velocity=False` the velocities. `observe_draw` adds the
-    standard scores to the observation, and `observe_command` the last action (0 at first). With `scaled_action`, which
-    our scripts use, an action of 0 is the middle of the set of controls, and an action of 1 is `Problem.u_unit` more.
+    standard scores to the observation. With `scaled_action`, which our scripts use, an action of 0 is the middle of the
+    set of controls, and an action of 1 is `Problem.u_unit` more.
 
-    `reset(options={"x0": x})` sets the starts x (N, n), and `{"draw": z}` the scores z (N, k). Raises BadInput for
-    anything else.
-
-    Only training changes these attributes, before a `reset`:
-
-    - `radius_scale`: a factor on the radii in which the reward pays the bonus, one number or one a phase (paper: 1)
-    - `bonus_width`: the distance beyond the radii over which this bonus falls linearly to 0 (paper: 0, a step)
-    - `flights_per_start` (`BatchedEnv`)
+    `reset(options={"x0": x})` sets the starts x (N, n), and `{"draw": z}` the scores z (N, k). `{"training": {...}}`
+    hands over fields of `PhasedTraining`. Raises BadInput for anything else.
     """
 
     metadata = {**BatchedEnv.metadata, **RENDERED}
+    training = PhasedTraining()
 
     def __init__(
         self,
@@ -71,7 +86,6 @@ class PhasedVectorEnv(BatchedEnv):
         observe_phase: bool = True,
         observe_velocity: bool = True,
         observe_draw: bool = False,
-        observe_command: bool = False,
         scaled_action: bool = False,
         render_mode: str | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
@@ -80,20 +94,17 @@ class PhasedVectorEnv(BatchedEnv):
         self.observe_phase = observe_phase
         self.observe_velocity = observe_velocity
         self.observe_draw = observe_draw
-        self.observe_command = observe_command
         self.scaled_action = scaled_action
         allowed = "needs `velocities` in the table, the states that it hides"
         refuse_unless(observe_velocity or problem.hidden_velocities, "observe_velocity", observe_velocity, allowed)
         allowed = "needs `scores` in the table, which it shows"
         refuse_unless(problem.scores or not observe_draw, "observe_draw", observe_draw, allowed)
-        self.radius_scale, self.bonus_width = 1.0, 0.0
         self._centre, self._unit = problem.u_centre, problem.u_unit
         action_box = (problem.u_box - self._centre) / self._unit if scaled_action else problem.u_box
-        spaces = Box(*self._observation_box(action_box), dtype=np.float64), Box(*action_box, dtype=np.float64)
+        spaces = Box(*self._observation_box(), dtype=np.float64), Box(*action_box, dtype=np.float64)
         super().__init__(num_envs, problem.steps, *spaces, render_mode, autoreset_mode)
         self._tabulate()
         self.observation_scale = self._scale_of_observations()
-        self.has_circles = problem.circles_count
         self.x = tuple(np.zeros(num_envs) for _ in range(problem.states))
         # the last applied control: (N,), or (N, m) if the table has a tuple of controls
         self.u = np.zeros((num_envs, problem.controls) if isinstance(problem.u_max, tuple) else num_envs)
@@ -102,12 +113,11 @@ class PhasedVectorEnv(BatchedEnv):
         self._parameters = problem.hidden(self.draw)
         self._phase = np.zeros(num_envs, dtype=np.int64)
         self._step_in_phase = np.zeros(num_envs, dtype=np.int64)
-        self._command = np.zeros((num_envs, problem.controls))
         self._costs = {part: np.zeros(num_envs) for part in problem.parts}
         self._bonus = np.zeros(num_envs)
         self._terminal_error = np.zeros((num_envs, len(problem.phases)))
 
-    def _observation_box(self, action_box):
+    def _observation_box(self):
         """The least and the greatest observation."""
         problem = self.problem
         high = [*problem.x_max]
@@ -123,10 +133,6 @@ class PhasedVectorEnv(BatchedEnv):
         scores = problem.scores if self.observe_draw else 0
         high += [LARGEST_SCORE] * scores
         low += [-LARGEST_SCORE] * scores
-        if self.observe_command:
-            least, greatest = action_box
-            low += np.minimum(least, 0.0).tolist()
-            high += np.maximum(greatest, 0.0).tolist()
         return np.array(low), np.array(high)
 
     def _scale_of_observations(self):
@@ -189,7 +195,7 @@ class PhasedVectorEnv(BatchedEnv):
             parameter[mask] = drawn
         for part in self._costs.values():
             part[mask] = 0.0
-        for array in (self.time, self._bonus, self._command, self._terminal_error):
+        for array in (self.time, self._bonus, self._terminal_error):
             array[mask] = 0.0
         self._phase[mask] = 0
         self._step_in_phase[mask] = 0
@@ -225,8 +231,6 @@ class PhasedVectorEnv(BatchedEnv):
             columns.append(phase / (len(problem.phases) - 1) * self.observe_phase)
         if self.observe_draw:
             columns.append(self.draw)
-        if self.observe_command:
-            columns.append(self._command)
         return np.column_stack(columns)
 
     def _applied(self, actions):
@@ -261,7 +265,6 @@ class PhasedVectorEnv(BatchedEnv):
             self._costs[part] += cost
         rewards = -sum(costs.values(), np.zeros(self.num_envs))
         self.u = u.T.copy() if isinstance(problem.u_max, tuple) else u[0]
-        self._command = (u.T - self._centre) / self._unit if self.scaled_action else u.T.copy()
         self.t = self.t + 1
         self.time = self.time + length
         self._step_in_phase += 1
@@ -370,14 +373,15 @@ class PhasedVectorEnv(BatchedEnv):
         for k in np.unique(of_phase):
             some = ending[of_phase == k]
             x, p = (tuple(value[some] for value in values) for values in (self.x, self._parameters))
-            scale = np.broadcast_to(self.radius_scale, len(phases))[k]
+            scale = np.broadcast_to(self.training.radius_scale, len(phases))[k]
             cost, error, radius = end_of_phase(self.problem, phases[k], x, p)
             self._terminal_error[some, k] = error
             self._costs["terminal"][some] += cost
             self._bonus[some] += phases[k].bonus * (error <= radius)
             share = error <= scale * radius
-            if self.bonus_width and phases[k].has_circle:
-                share = np.clip(1 - (error - scale * radius) / self.bonus_width, 0, 1)
+            width = self.training.bonus_width
+            if width and phases[k].has_circle:
+                share = np.clip(1 - (error - scale * radius) / width, 0, 1)
             rewards[some] = -cost + phases[k].bonus * share
         self._phase[ending] += 1
         self._step_in_phase[ending] = 0
@@ -429,20 +433,17 @@ def slope_along(event: Callable, x, dx) -> np.ndarray:
 class PhasedEnv(SingleEnv):
     """One flight of `PhasedVectorEnv`."""
 
-    radius_scale = of_batch("radius_scale", "Factor on the radii in which the reward pays the bonus (1: the paper).")
-    bonus_width = of_batch("bonus_width", "Distance beyond them over which the bonus falls to 0 (0: the paper).")
-
 
 def make_phased_vector(env_id: str, num_envs: int = 1, **options) -> PhasedVectorEnv:
     """The batched environment of a problem in `PROBLEMS`. `gymnasium.make_vec` calls it."""
     check_options(PhasedVectorEnv, options)
-    return PhasedVectorEnv(PROBLEMS[env_id], num_envs, **options).sealed()
+    return PhasedVectorEnv(PROBLEMS[env_id], num_envs, **options)
 
 
 def make_phased(env_id: str, **options) -> PhasedEnv:
     """The single environment of a problem in `PROBLEMS`. `gymnasium.make` calls it."""
     refuse_autoreset(options)
-    return PhasedEnv(make_phased_vector(env_id, **options)).sealed()
+    return PhasedEnv(make_phased_vector(env_id, **options))
 
 
 def fly(env_id: str, policy: Callable, x0, draw=None, **options) -> dict:

@@ -7,7 +7,7 @@ Reading order: the batched environment (draws, observations, step, reward), the 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import gymnasium as gym
@@ -15,8 +15,8 @@ import numpy as np
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
 
-from common.batch import RENDERED, BatchedEnv, SingleEnv, check_options, of_batch, refuse_autoreset
-from common.errors import BadInput, refuse_unless
+from common.batch import RENDERED, BatchedEnv, SingleEnv, Training, check_options, checked, numeric, refuse_autoreset
+from common.errors import BadInput, is_finite, refuse_unless
 from common.flying import fly_until_ended
 from rocket.dispersion import (
     DISPERSION,
@@ -28,7 +28,7 @@ from rocket.dispersion import (
     largest_draw,
     nominal_vehicles,
 )
-from rocket.failure import FAILURE_DRAW, HEALTHY_DRAW, check_failure, failure_scores
+from rocket.failure import FAILURE_DRAW, FAILURE_TIMES, HEALTHY_DRAW, check_failure, failure_scores
 from rocket.flight import Fleet, Steps, cut_off, fly_step, steps_at, steps_until, unit_directions
 from rocket.missions import PAPER_MISSION, ROCKETS, Mission
 from rocket.navigation import LARGEST_SCORE as LARGEST_NOISE_SCORE
@@ -50,11 +50,24 @@ from rocket.rewards import (
     penalties,
     precision_points,
     terminal_reward,
-    trajectory_reward,
 )
 from rocket.vehicle import Rocket, delta_v
 
 ACTION_FRAMES = ("eci", "local")
+
+
+@dataclass(frozen=True)
+class RocketTraining(Training):
+    """What a training of a rocket hands over. The defaults are the reported reward and the environment's failures."""
+
+    # scale of R_terminal in the reward, a curriculum; `final_info` keeps TERMINAL_SCALE
+    terminal_scale: float = numeric(TERMINAL_SCALE, low=1e-12)
+    guidance: bool = checked(False, lambda value: value in (False, True), "must be True or False")  # pay R_guidance
+    mass_weight: float = numeric(0.0)  # reward lost per `mass_unit` of propellant burnt in the last phase
+    # "ignition" for a while where the environment's `failure_time` is "random" (None: the environment's)
+    failure_time: str | None = checked(
+        None, lambda value: value in (None, *FAILURE_TIMES), f"must be None or one of {', '.join(FAILURE_TIMES)}"
+    )
 
 
 class RocketVectorEnv(BatchedEnv):
@@ -92,12 +105,12 @@ class RocketVectorEnv(BatchedEnv):
     With a `cutoff` mission (ours; the paper fixes the final time) the engine stops when the energy reaches the target's
     in the last phase. The moment is found within the step, to 1e-10, and ends the episode.
 
-    Every flight also ends below altitude 0, which is a crash, and at `end_time`. With cut-off and draws the burn-out of
-    the flight's own last stage takes the place of `end_time`, so t_norm may end below 0. This holds unless `end_time`
-    was changed or is not the last burn's end.
+    Every flight also ends below altitude 0, which is a crash, and at `end_time` (s, by default the rocket's, which is
+    the latest possible). With cut-off and draws the burn-out of the flight's own last stage takes the place of
+    `end_time`, so t_norm may end below 0. This holds unless `end_time` is given or is not the last burn's end.
 
-    Reward: the sum of R_orbital, R_trajectory, R_guidance, R_penalties and R_terminal, which are functions of
-    `rewards.py`. `final_info` has, (N,) each unless a shape is given:
+    Reward: the sum of R_orbital, R_trajectory, R_guidance, R_penalties and R_terminal (`rewards.py`). `final_info` has,
+    (N,) each unless a shape is given:
 
     - `final_y` (N, 7), the exact r, v and m
     - `error_norm`, and `error` (N, 6), the terminal error in ECI
@@ -107,17 +120,11 @@ class RocketVectorEnv(BatchedEnv):
     - with dispersion or failures `draw` (N, k), and `dry` for a flight that is out of fuel
     - with failures `failure` (N, 3): group of engines, moment (s) and share lost; -1, 0, 0 for a healthy flight
 
-    A training may set these attributes before a `reset`:
-
-    - `flights_per_start` (`BatchedEnv`): flights of each draw of a `reset`
-    - `guidance`: whether R_guidance is charged
-    - `terminal_scale`: the scale of R_terminal in the reward, a curriculum; `final_info` keeps `TERMINAL_SCALE`
-    - `failure_time`: "ignition" for a while where it was "random"
-    - `mass_weight` (a price per `mass_unit`), `trajectory_weight`, `guidance_weight` and `end_time` (s, at most the
-      last phase's end), which our training leaves as they are
+    `reset(options={"training": {...}})` hands over fields of `RocketTraining`.
     """
 
     metadata = {**BatchedEnv.metadata, **RENDERED}
+    training = RocketTraining()
     PARTS = ("R_orbital", "R_trajectory", "R_guidance", "R_penalties", "R_terminal")
 
     def __init__(
@@ -134,6 +141,7 @@ class RocketVectorEnv(BatchedEnv):
         failure: float = 0.0,
         failure_time: str = "random",
         navigation_noise: tuple[float, float] | None = None,
+        end_time: float | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
     ):
         if action_frame not in ACTION_FRAMES:
@@ -157,14 +165,13 @@ class RocketVectorEnv(BatchedEnv):
         self.navigation_noise = checked_noise(navigation_noise)
         self._noise = np.zeros((num_envs, 0, OBSERVED))  # standard scores of the running episodes' observations
         self._noise_stream: tuple | None = None  # the seeded generator, and the noise's own
-        self.mass_weight = 0.0
-        self.trajectory_weight = 0.0
-        self.guidance_weight = 0.1
-        self.guidance = False
-        self.terminal_scale = TERMINAL_SCALE
+        latest = self.rocket.end_time
+        self.end_time = latest if end_time is None else end_time
+        possible = is_finite(self.end_time) and 0 < self.end_time <= latest
+        refuse_unless(possible, "end_time", f"{end_time} s", f"must be positive and at most {latest}")
         super().__init__(num_envs, 1, *self._spaces(), render_mode, autoreset_mode)
         self._build()
-        self.end_time = self.rocket.end_time  # sets episode_steps, too
+        self._make_clock()
         self._axes = target_axes(self.rocket)
         h, e = target_orbit(self.rocket.target, self.rocket.mu)
         self._h_axes = self._axes / np.linalg.norm(h)
@@ -172,7 +179,7 @@ class RocketVectorEnv(BatchedEnv):
         self.y = np.repeat(self.rocket.x0[:, None], num_envs, axis=1)  # (7, N)
         self.u = np.zeros((3, num_envs))  # the direction of the step before, in ECI
         self._parts = np.zeros((len(self.PARTS), num_envs))
-        self._distance, self._energy, self.time, self._max_altitude = np.zeros((4, num_envs))
+        self._distance, self.time, self._max_altitude = np.zeros((3, num_envs))
         self._crashed = np.zeros(num_envs, dtype=bool)
         self._coasted = np.zeros(num_envs, dtype=bool)  # in the step before
         self._everyone = np.arange(num_envs)
@@ -196,7 +203,7 @@ class RocketVectorEnv(BatchedEnv):
 
     def _drawn(self, draw):
         """The vehicles of draws (n, k)."""
-        return draw_vehicles(self.rocket, self.dispersion, draw, self.failure, self.failure_time)
+        return draw_vehicles(self.rocket, self.dispersion, draw, self.failure, self.setting("failure_time"))
 
     def _spaces(self):
         """The spaces of one environment. Their bounds hold every vehicle that may be drawn."""
@@ -216,16 +223,8 @@ class RocketVectorEnv(BatchedEnv):
         low[6:9] = 0.0, min(0.0, 1 - latest / self.rocket.end_time), 0.0
         return Box(low, high, dtype=np.float64), Box(-1.0, 1.0, (3,), dtype=np.float64)
 
-    @property
-    def end_time(self) -> float:
-        """Seconds after which an episode ends at the latest. The last step is shorter if 2 s do not divide it."""
-        return self._end_time
-
-    @end_time.setter
-    def end_time(self, value: float):
-        if not 0 < value <= self.rocket.end_time:
-            raise ValueError(f"end_time is {value} s; it must be positive and at most {self.rocket.end_time}")
-        self._end_time = float(value)
+    def _make_clock(self):
+        """Set the number of steps, and make the table of the steps that all flights share without draws."""
         self.episode_steps = int(self._set_ends(self._largest).max())
         # without draws all flights have the same steps, which are worked out once for the one vehicle
         self._table = None
@@ -235,8 +234,8 @@ class RocketVectorEnv(BatchedEnv):
 
     def _set_ends(self, vehicles):
         """Set when the episodes of these vehicles end at the latest. Returns the number of their steps."""
-        own = self.has_draws and self.cutoff and self._end_time == self.rocket.end_time == self.rocket.burns[-1].end
-        self._latest = vehicles.burn_out if own else np.full(len(vehicles.mass), self._end_time)  # s
+        own = self.has_draws and self.cutoff and self.end_time == self.rocket.end_time == self.rocket.burns[-1].end
+        self._latest = vehicles.burn_out if own else np.full(len(vehicles.mass), float(self.end_time))  # s
         self._steps = steps_until(self._latest, self.dt)
         return self._steps
 
@@ -247,8 +246,6 @@ class RocketVectorEnv(BatchedEnv):
             if taken:
                 allowed = f"the only one is {taken[0]!r}" if len(taken) == 1 else "they may be 'draw' and 'noise'"
             raise BadInput(f"reset options are {options!r}; {allowed}")
-        if not 0 < self.terminal_scale < np.inf:
-            raise ValueError(f"terminal_scale is {self.terminal_scale}; it must be positive and finite")
         if self.has_draws:
             self._launch(mask, options.get("draw"))
         if self.navigation_noise:
@@ -259,9 +256,7 @@ class RocketVectorEnv(BatchedEnv):
         self.u[:, mask] = 0.0
         self._max_altitude[mask] = 0.0
         self.time[mask] = 0.0
-        distance, energy = self._progress()
-        self._distance[mask] = distance[mask]
-        self._energy[mask] = energy[mask]
+        self._distance[mask] = self._progress()[mask]
 
     def _launch(self, mask, given):
         """Set the vehicles of the environments in `mask`, by the given draws (N, k) or by new ones.
@@ -316,7 +311,7 @@ class RocketVectorEnv(BatchedEnv):
 
     def _scores(self, n):
         """New draws (n, k). Draws of groups come in pairs, z and -z, so that the mean of a few is near zero."""
-        in_pairs = self.flights_per_start > 1
+        in_pairs = self.training.flights_per_start > 1
         if in_pairs:
             half = self.np_random.standard_normal((-(-n // 2), self._scores_drawn))
             scores = np.stack([half, -half], axis=1).reshape(-1, self._scores_drawn)[:n]
@@ -354,10 +349,10 @@ class RocketVectorEnv(BatchedEnv):
         return draw
 
     def _progress(self):
-        """The distance L to the target orbit (see `orbital_reward`) and the specific energy, both (N,)."""
+        """The distance L (N,) to the target orbit (see `orbital_reward`)."""
         h, e = orbit_vectors(self.y, self.rocket.mu)
         error = np.concatenate([self._h_axes @ h, self._axes @ e]) - self._target
-        return np.abs(error).sum(axis=0), specific_energy(self.y, self.rocket.mu)
+        return np.abs(error).sum(axis=0)
 
     def _observe(self):
         obs = np.empty((self.num_envs, *self.single_observation_space.shape))
@@ -439,10 +434,11 @@ class RocketVectorEnv(BatchedEnv):
     def _reward(self, before, u, phase, altitude, done):
         """Add the five parts of this step to their sums. Returns the reward (N,): their total.
 
-        The reward has R_terminal with `terminal_scale`, the sums have it with `TERMINAL_SCALE`.
+        R_trajectory stays 0 (`rewards.py`). The reward has R_terminal with the training's `terminal_scale`, the sums
+        have it with `TERMINAL_SCALE`.
         """
         t = self.t
-        distance, energy = self._progress()
+        distance = self._progress()
         turn = np.sqrt(((u - self.u) ** 2).sum(axis=0)) * (t > 0)
         if self._has_coasts:  # without thrust neither a direction nor the turn away from it counts
             coasts = self._coasts[phase]
@@ -451,20 +447,19 @@ class RocketVectorEnv(BatchedEnv):
         burnt = (before[6] - self.y[6]) * (phase == self._last_phase)
         parts = np.zeros_like(self._parts)
         parts[0] = orbital_reward(self._distance, distance)
-        parts[1] = trajectory_reward(self._energy, energy, phase < self._last_phase, self.trajectory_weight)
-        if self.guidance:
+        if self.training.guidance:
             until = self.mission.guided_until or self.rocket.burns[0].end
             times, angles = REFERENCE_PITCH
             pitch = np.radians(np.interp(self.rocket.dt * t, until * np.array(times), angles, right=np.nan))
-            parts[2] = guidance_reward(u, *local_frame(before, self._axes[2])[:2], pitch, self.guidance_weight)
+            parts[2] = guidance_reward(u, *local_frame(before, self._axes[2])[:2], pitch)
         left = np.minimum(self.y[6] - self.vehicles.dry_mass, self.vehicles.propellant)
-        parts[3] = penalties(self.mission, altitude, self.time, turn, burnt, left, self.mass_weight)
+        parts[3] = penalties(self.mission, altitude, self.time, turn, burnt, left, self.training.mass_weight)
         self._parts += parts
         if done.any():
             error_norm = np.linalg.norm(terminal_error(self.y[:, done].T, self.rocket), axis=1)
             self._parts[4, done] += terminal_reward(error_norm)
-            parts[4, done] = terminal_reward(error_norm, self.terminal_scale)
-        self._distance, self._energy = distance, energy
+            parts[4, done] = terminal_reward(error_norm, self.training.terminal_scale)
+        self._distance = distance
         return parts.sum(axis=0)
 
     def _final_info(self):
@@ -520,14 +515,8 @@ def reachable(rocket: Rocket, dispersion: float, end: float) -> tuple[float, flo
 
 
 class RocketEnv(SingleEnv):
-    """One flight of `RocketVectorEnv`, with those of the batch's attributes that are named below."""
+    """One flight of `RocketVectorEnv`."""
 
-    mass_weight = of_batch("mass_weight", "Reward lost per `mass_unit` of propellant burnt in the last phase.")
-    trajectory_weight = of_batch("trajectory_weight", "Weight of R_trajectory.")
-    guidance_weight = of_batch("guidance_weight", "Weight of R_guidance.")
-    guidance = of_batch("guidance", "Whether R_guidance charges for leaving the reference pitch.")
-    end_time = of_batch("end_time", "Seconds after which an episode ends at the latest.")
-    terminal_scale = of_batch("terminal_scale", "The scale of R_terminal in the reward; reports keep TERMINAL_SCALE.")
     draw = property(lambda self: self.batch.draw, doc="The running episode's draw (1, k); zeros if nothing is drawn.")
 
 
@@ -540,13 +529,13 @@ def flown_mission(mission: Mission, rocket: Rocket | None = None, table_isp: boo
 def make_rocket_vector(env_id: str, num_envs: int = 1, rocket: Rocket | None = None, **options) -> RocketVectorEnv:
     """The batched environment of a mission in `ROCKETS`, or of another rocket on it. `gymnasium.make_vec` calls it."""
     check_options(RocketVectorEnv, options, "rocket")
-    return RocketVectorEnv(num_envs, flown_mission(ROCKETS[env_id], rocket), **options).sealed()
+    return RocketVectorEnv(num_envs, flown_mission(ROCKETS[env_id], rocket), **options)
 
 
 def make_rocket(env_id: str, **options) -> RocketEnv:
     """The single environment of a mission in `ROCKETS`. `gymnasium.make` calls it."""
     refuse_autoreset(options)
-    return RocketEnv(make_rocket_vector(env_id, **options)).sealed()
+    return RocketEnv(make_rocket_vector(env_id, **options))
 
 
 def fly_rocket(
@@ -561,9 +550,7 @@ def fly_rocket(
     Returns t (K+1,) s, u (K, 3) unit directions in ECI, y (K+1, 7) with r, v and m, reward (K,), the sums so far of
     `PARTS` as `parts` (K, 5), and the entries of the last step's `final_info`.
     """
-    env: Any = gym.make_vec(env_id, num_envs=1, **options)  # a RocketVectorEnv
-    if end_time is not None:
-        env.end_time = end_time
+    env: Any = gym.make_vec(env_id, num_envs=1, end_time=end_time, **options)  # a RocketVectorEnv
     given = {} if draw is None else {"draw": [draw]}
     if noise is not None and env.navigation_noise:
         given["noise"] = noise(env.episode_steps + 1)

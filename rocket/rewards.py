@@ -1,4 +1,8 @@
-"""The five parts of the reward. The paper says what each part is for and gives no formula. The formulas are ours."""
+"""The parts of the reward. The paper says what each part is for and gives no formula. The formulas are ours.
+
+The paper names five parts. R_trajectory has no weight here: it is always 0, so it has no formula. R_orbital already
+pays for every step towards the target.
+"""
 
 from __future__ import annotations
 
@@ -18,22 +22,18 @@ def orbital_reward(distance, next_distance):
     return 10.0 * (distance - next_distance)
 
 
-def trajectory_reward(energy, next_energy, early, weight):
-    """R_trajectory = w (E_{t+1} - E_t) / (1 MJ/kg) while `early`, before the last burn. E is the specific energy."""
-    return weight * (next_energy - energy) / 1e6 * early
-
-
 # (times, degrees above the horizon), our guess; times are parts of a mission's `guided_until` (paper's rocket: 150.4 s)
 REFERENCE_PITCH = ((0.0, 10 / 150.4, 40 / 150.4, 0.5, 1.0), (90.0, 88.0, 72.0, 55.0, 35.0))
+GUIDANCE_WEIGHT = 0.1  # price of a step at a right angle to the reference direction
 
 
-def guidance_reward(u, up, along, pitch, weight):
-    """R_guidance = -w (1 - u . d), where d has the reference pitch above the horizon and lies in the target's plane.
+def guidance_reward(u, up, along, pitch):
+    """R_guidance = -0.1 (1 - u . d), where d has the reference pitch above the horizon and lies in the target's plane.
 
     u, up and along are (3, N). pitch (N,) is in rad at the step's start. It is NaN where there is no guidance.
     """
     cosine = (u * (np.sin(pitch) * up + np.cos(pitch) * along)).sum(axis=0)
-    return np.where(np.isnan(pitch), 0.0, -weight * (1 - cosine))
+    return np.where(np.isnan(pitch), 0.0, -GUIDANCE_WEIGHT * (1 - cosine))
 
 
 def penalties(mission: Mission, altitude, time, turn, burnt, left, mass_weight):

@@ -172,9 +172,6 @@ class RocketTask:
     def remark_on_seed(self, eval_seed: int) -> str | None:
         return None  # draws of an evaluation come from another stream
 
-    def choices(self) -> dict[str, tuple[str, ...]]:
-        return {"failure_time": FAILURE_TIMES}
-
     def refusal(
         self, trains: bool, observe_phase: bool = True, failure: float = 0.0, navigation_noise=None, **env_options
     ):

@@ -45,7 +45,7 @@ class UnevenEnvs:
         self.given_obs.append(self.rng.uniform(-1, 1, (self.num_envs, 3)))
         return self.given_obs[-1]
 
-    def reset(self, seed=None):
+    def reset(self, seed=None, options=None):
         self.t, self.sums = np.zeros(self.num_envs, dtype=int), np.zeros(self.num_envs)
         self.given_obs, self.taken_actions, self.given_rewards = [], [], []
         return self._draw(), {}
@@ -102,7 +102,8 @@ class OneUpdate:
 
 def update(script, args, modules, envs, batch, iteration=1):
     """One update of `script.train` on this batch, in groups of `envs.flights_per_start` and without a curriculum."""
-    given = {"rollout": lambda *inputs: (batch, None), "set_curriculum": lambda *inputs: envs.flights_per_start}
+    training = {"flights_per_start": envs.flights_per_start}
+    given = {"rollout": lambda *inputs: (batch, None), "curriculum": lambda *inputs: training}
     run = OneUpdate(iteration)
     with contextlib.suppress(UpdateDone), mock.patch.multiple(script, **given):
         script.train(args, *modules, envs, run)

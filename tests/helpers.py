@@ -1,12 +1,12 @@
 """What several test files use: a task's table, title and figures; a policy with random weights."""
 
 import json
-from dataclasses import asdict
 
 import gymnasium as gym
 import safetensors.torch
 import torch
 
+from common.flags import plain_args
 from common.tasks import task_of
 
 SMALL = {"embed_dim": 8, "num_heads": 2, "mlp_dim": 12, "hidden_dim": 10}
@@ -37,6 +37,6 @@ def save(script, folder, **changes):
         for parameter in agent.parameters():
             parameter += 0.3 * torch.randn_like(parameter)
     counters = dict.fromkeys(["seed", "total_updates", "global_step", "training_seconds", "wall_seconds"], "1")
-    metadata = {"env_id": args.env_id, "args": json.dumps(asdict(args)), **counters}
+    metadata = {"env_id": args.env_id, "args": json.dumps(plain_args(args)), **counters}
     safetensors.torch.save_file(agent.state_dict(), folder / "agent.safetensors", metadata)
     return agent, args, options

@@ -211,9 +211,9 @@ def single(env_id, **options):
     return gym.make(env_id, disable_env_checker=True, **options)  # it would take half of the time
 
 
-def fly(envs, policy):
+def fly(envs, policy, **training):
     """One episode of a batch of one through its public interface: observations (K+1, 9), rewards (K,), final info."""
-    obs, info = envs.reset()
+    obs, info = envs.reset(options={"training": training})
     seen, rewards = [obs[0]], []
     while "final_obs" not in info:
         obs, reward, terminated, truncated, info = envs.step(np.asarray(policy(seen[-1], len(rewards)))[None])

@@ -29,12 +29,11 @@ def paid(episodes, progress=0.4, env_id=ENV_ID, flying=N, **flags):
     """The rewards (T, flying) that `add_rewards` adds; flight k lives k + 1 steps."""
     args = script.Args(**{**script.RECIPES[ENV_ID], "env_id": env_id, "num_envs": flying, **flags})
     envs = gym.make_vec(env_id, num_envs=flying, dispersion=args.dispersion).unwrapped
-    envs.flights_per_start = args.flights_per_start
-    envs.terminal_scale = 0.002
+    training = {"flights_per_start": round(args.flights_per_start.at(0.0)), "terminal_scale": 0.002}
     alive = (torch.arange(flying)[:, None] <= torch.arange(flying)).float()
     rewards = torch.zeros(flying, flying)
     batch = script.Batch(*[torch.zeros(0)] * 3, rewards, torch.zeros(0), alive, torch.zeros(0))
-    script.add_rewards(envs, args, progress, batch, episodes)
+    script.add_rewards(args, progress, training, envs, batch, episodes)
     return batch.rewards.numpy()
 
 
@@ -144,8 +143,10 @@ def test_several_processes_pay_what_one_pays(dispersion, monkeypatch):
     """Each its own flights, by the fit to all flights of one start; 8 of 32 are the first process's."""
     episodes, flags = flights(), {"dispersion": dispersion, "flights_per_start": 8}
     whole = at_the_end(paid(episodes, **flags))
+    monkeypatch.setattr(script.runs, "gathered", lambda own: episodes)
     monkeypatch.setattr(script.runs, "all_gather", lambda count: [8, 24])
     for rank, part in ((0, slice(8)), (1, slice(8, None))):
         monkeypatch.setattr(script.runs, "rank_and_world_size", lambda rank=rank: (rank, 2))
-        rewards = at_the_end(paid(episodes, flying=len(whole[part]), **flags))
+        own = {name: values[part] for name, values in episodes.items()}
+        rewards = at_the_end(paid(own, flying=len(whole[part]), **flags))
         np.testing.assert_array_equal(rewards, whole[part])

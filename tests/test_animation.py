@@ -215,8 +215,8 @@ def test_frames_of_the_batch_are_those_of_single_environments(env_id):
 
 
 def test_after_autoreset_the_next_episode_is_drawn():
-    batch = gym.make_vec("RocketAscent-v0", num_envs=2, render_mode="rgb_array", action_frame="local")
-    batch.unwrapped.end_time = 6.0
+    options = {"render_mode": "rgb_array", "action_frame": "local", "end_time": 6.0}
+    batch = gym.make_vec("RocketAscent-v0", num_envs=2, **options)
     batch.reset()
     begin = batch.render()[0]
     for _ in range(3):

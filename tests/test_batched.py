@@ -60,14 +60,13 @@ def countdown(monkeypatch):
     monkeypatch.setitem(gym.registry, "Countdown-v0", spec)
     ids = (*script.ENV_IDS, "Countdown-v0")
     monkeypatch.setattr(script, "ENV_IDS", ids)
-    monkeypatch.setattr(script.BUFFERS, "env_ids", ids)
     return "Countdown-v0"
 
 
 def test_a_registered_environment_is_an_id(countdown, monkeypatch):
     assert countdown in env_ids() and countdown in envs.own_ids() and "CartPole-v1" not in env_ids()
     assert task_of(countdown).env_id == countdown
-    assert runs.observation_scale(countdown) == {"observation_scale": [0.5, 2.0]}
+    assert runs.observation_scale(countdown) == [0.5, 2.0]
     spec = gym.envs.registration.EnvSpec(id="Foreign-v0", entry_point=Foreign, vector_entry_point=Foreign)
     monkeypatch.setitem(gym.registry, "Foreign-v0", spec)
     with pytest.raises(BadInput, match="^env_id is 'Foreign-v0'; .* derived from BatchedEnv"):

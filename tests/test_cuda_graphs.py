@@ -80,7 +80,7 @@ def test_the_same_flights(script, L, captured):
         flown = []
         for agent, flights in ((plain, envs), (quick, other_envs)):
             torch.manual_seed(seed)
-            flown.append(script.rollout(agent, flights, 1.0, 0.1)[0])
+            flown.append(script.rollout(agent, flights, {}, 1.0, 0.1)[0])
         for name, expected in vars(flown[0]).items():
             if expected is not None:
                 torch.testing.assert_close(vars(flown[1])[name], expected, rtol=1e-9, atol=1e-9, msg=name)

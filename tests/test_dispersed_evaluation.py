@@ -149,7 +149,7 @@ def script():
 
 def parse(*argv):
     rocket = script()
-    return runs.parse_args(rocket.Args, rocket.recipe, list(argv), rocket.ENV_OPTIONS, rocket.BUFFERS)[0]
+    return runs.parse_args(rocket, list(argv))[0]
 
 
 def test_how_many_flights():

@@ -299,17 +299,17 @@ def test_seeds():
 def test_flights_of_a_group_share_their_draw(num_envs, group, groups):
     """Flight k has draw k // G, every second one the mirror of the one before; given draws stay each flight's own."""
     batch, half, few = make(CUTOFF, num_envs), make(CUTOFF, -(-groups // 2)), make(CUTOFF, groups)
-    batch.flights_per_start = group
+    training = {"training": {"flights_per_start": group}}
     rows = np.arange(num_envs) // group
     for seed in (1, None):  # the second draws anew
-        batch.reset(seed=seed)
+        batch.reset(seed=seed, options=training)
         half.reset(seed=seed)  # a smaller batch without groups, whose draws have no mirror
         few.reset(options={"draw": np.concatenate([[z, -z] for z in half.draw])[:groups]})
         np.testing.assert_array_equal(batch.draw, few.draw[rows])
         np.testing.assert_array_equal(batch.vehicles.mass, few.vehicles.mass[rows])
         assert len(np.unique(batch.draw[:, 0])) == groups
     given = np.linspace(-1, 1, batch.draw.size).reshape(batch.draw.shape)
-    batch.reset(options={"draw": given})
+    batch.reset(options={"draw": given, **training})
     np.testing.assert_array_equal(batch.draw, given)
 
 
@@ -469,8 +469,7 @@ def test_a_crash_is_charged_the_flights_own_propellant():
     z = np.zeros((2, 16))
     z[1, DRAW.index("propellant_3")] = 2.0
     batch = make(CUTOFF, 2)
-    batch.mass_weight = 1.0
-    batch.reset(options={"draw": z})
+    batch.reset(options={"draw": z, "training": {"mass_weight": 1.0}})
     final = batch.step(np.tile([-1.0, 0.0, 0.0], (2, 1)))[4]["final_info"]
     assert final["crashed"].all()
     difference = final["R_penalties"][1] - final["R_penalties"][0]

@@ -85,7 +85,7 @@ def test_commands_name_what_is_there(page):
         if not files or not files[0].startswith("ppo_gtrxl") or {"MyRocket-v0", "--help"} & set(words):
             continue
         script = importlib.import_module(files[0].removesuffix(".py"))
-        args, _ = runs.read_flags(script.Args(), words[words.index(files[0]) + 1 :])
+        args = script.Args(**runs.read_flags(script.Args(), words[words.index(files[0]) + 1 :]))
         if not any("runs/" in word for word in words):  # the reader's run, of which a page cannot know
             runs.check(args, script.ENV_IDS)
 

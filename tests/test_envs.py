@@ -16,7 +16,7 @@ from gymnasium.utils.env_checker import check_env
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from envs import PROBLEMS, PhasedVectorEnv, fly
+from envs import PROBLEMS, BadInput, PhasedVectorEnv, fly
 
 # The paper's tables, a phase a row: steps, target, radius, R, terminal weight, bonus. Q is the identity throughout.
 PAPER = {
@@ -152,15 +152,14 @@ def test_rewards_are_the_papers(env_id):
 
 
 def returns_with(env_id, name, values):
-    """Sums of rewards (3,) of the same flights with each value of an attribute, and the `final_info` of the first.
+    """Sums of rewards (3,) of the same flights with each value handed over, and the `final_info` of the first.
 
     What is reported must be the same to the bit with all of them.
     """
     actions, sums, finals = random_actions(env_id, 3), [], []
     for value in values:
         envs = gym.make_vec(env_id, num_envs=3)
-        setattr(envs.unwrapped, name, value)
-        envs.reset(options={"x0": CORNERS[:3]})
+        envs.reset(options={"x0": CORNERS[:3], "training": {name: value}})
         steps = [envs.step(action) for action in actions]
         sums.append(sum(step[1] for step in steps))
         finals.append(steps[-1][4]["final_info"])
@@ -193,15 +192,12 @@ def test_bonus_falls_to_nothing_over_its_width(env_id):
 
 
 @pytest.mark.parametrize("name, value", [("radius_scale", 1e4), ("bonus_width", 1e9)])
-def test_the_single_environment_has_the_curriculum_s_attributes(name, value):
-    returns = []
-    for changed in (False, True):
-        env = gym.make("VanDerPol-v0")
-        if changed:
-            setattr(env.unwrapped, name, value)
-        env.reset(options={"x0": [1.0, 1.0]})
+def test_what_a_training_hands_over_holds_until_the_next_reset(name, value):
+    env, returns = gym.make("VanDerPol-v0"), []
+    for training in ({}, {"training": {name: value}}, {}):
+        env.reset(options={"x0": [1.0, 1.0], **training})
         returns.append(sum(env.step([1.5])[1] for _ in range(70)))
-    assert returns[1] - returns[0] == pytest.approx(20.0)
+    assert returns[1] - returns[0] == pytest.approx(20.0) and returns[2] == returns[0]
 
 
 # --- observations -----------------------------------------------------------------------------------------------------
@@ -426,10 +422,10 @@ def test_starts_follow_the_seed(env_id):
 def test_flights_per_start(env_id, num_envs, group, groups):
     """Environment k flies start k // G: the draws of a smaller batch, each G times, at a reset and where all end."""
     envs, few = gym.make_vec(env_id, num_envs=num_envs), gym.make_vec(env_id, num_envs=groups)
-    envs.unwrapped.flights_per_start = group
     rows = np.arange(num_envs) // group
     actions = random_actions(env_id, num_envs)
-    seen, drawn = envs.reset(seed=3)[0], few.reset(seed=3)[0]
+    seen, _ = envs.reset(seed=3, options={"training": {"flights_per_start": group}})
+    drawn, _ = few.reset(seed=3)
     for _ in range(2):
         np.testing.assert_array_equal(seen, drawn[rows])
         assert len(np.unique(seen[:, 0])) == groups
@@ -444,10 +440,9 @@ def test_flights_per_start(env_id, num_envs, group, groups):
 @pytest.mark.parametrize("env_id, options", [("DoubleIntegrator-v0", {}), ("RocketAscent-v0", {"dispersion": 1.0})])
 def test_bad_flights_per_start_are_refused(env_id, options, group):
     envs = gym.make_vec(env_id, num_envs=2, **options)
-    assert envs.unwrapped.flights_per_start == 1
-    envs.unwrapped.flights_per_start = group
-    with pytest.raises(ValueError, match="flights_per_start is .*; it must be a whole number of at least 1"):
-        envs.reset()
+    assert envs.unwrapped.training.flights_per_start == 1
+    with pytest.raises(BadInput, match="flights_per_start is .*; it must be a whole number of at least 1"):
+        envs.reset(options={"training": {"flights_per_start": group}})
 
 
 @pytest.mark.parametrize("x0", [[[0.0, 0.0]], [[0.0, 0.0], [np.nan, 0.0]]])  # fmt: skip

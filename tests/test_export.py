@@ -30,7 +30,7 @@ RESULTS = ROOT / "results"
 SITE = 20.0  # degrees east
 EXTRAS = "needs requirements-extras.txt"
 ROCKET_OPTIONS = [{"action_frame": "local"}, {"observe_draw": True, "dispersion": 1.0}]
-PHASED_OPTIONS = [{"scaled_action": True}, {"observe_phase": False, "observe_command": True}]
+PHASED_OPTIONS = [{"scaled_action": True}, {"observe_phase": False}]
 
 
 def command(monkeypatch, capsys, *words):

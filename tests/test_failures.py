@@ -255,8 +255,7 @@ def test_the_draws_of_an_evaluation_are_its_seeds():
 
 def test_of_two_groups_one_fails():
     batch = make(num_envs=40, dispersion=1)
-    batch.flights_per_start = 4
-    batch.reset(seed=3)
+    batch.reset(seed=3, options={"training": {"flights_per_start": 4}})
     by_group = batch.draw.reshape(10, 4, -1)
     assert (by_group == by_group[:, :1]).all()
     pairs = by_group[:, 0].reshape(5, 2, -1)

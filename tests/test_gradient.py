@@ -243,7 +243,7 @@ def test_the_saved_policy_flies_as_a_law_of_the_comparison(tmp_path, monkeypatch
     path.write_bytes(gradient.policy_file(agent, args, curve, short["recipe"]))
     arrays, about = fly_checkpoint(path, 1.0, 0, 10)
     assert about["knows"] == "draws in training"
-    assert agent.nominal_flight.any()
+    assert ppo_gtrxl_rocket.has_nominal_flight(agent)
     _, expected = evaluate_dispersed(CUTOFF, agent.make_policy(600), 0, 10, 1.0, action_frame="local")
     np.testing.assert_allclose(arrays["final_error"], expected["final_error"], atol=1e-5)
 

@@ -1,6 +1,6 @@
 """The Gated Transformer-XL: rollout = training, and both against the paper's equations in plain NumPy loops.
 
-The scripts' shared sections are the same to the letter (test_scripts.py), so one script stands for all.
+The scripts' shared sections are the same (test_scripts.py), so one script stands for all.
 """
 
 import gymnasium as gym
@@ -70,7 +70,7 @@ def test_rollout_stores_what_training_recomputes(dtype, uneven_envs):
     """The real `rollout`, episodes of different lengths in one batch and restarts within it."""
     envs = uneven_envs([23, 5, 17, 1], spare_steps=2)
     agent = make_agent(dtype, envs, memory_length=4)
-    batch, finals = script.rollout(agent, envs, 0.1, 0.1)
+    batch, finals = script.rollout(agent, envs, {}, 0.1, 0.1)
     alive = np.arange(25)[:, None] < envs.lengths
     np.testing.assert_array_equal(batch.alive.numpy(), alive)
     hidden = agent.encode(batch.obs.transpose(0, 1), batch.memory).transpose(0, 1)

@@ -109,13 +109,17 @@ def test_a_drawn_environment_can_be_copied(env_id, clone):
 
 
 @every_kind
-def test_a_misspelt_attribute_is_refused(env_id):
-    batch, single = make(env_id, 2), gym.make(env_id).unwrapped
-    for env in (batch, single, copy.deepcopy(single)):
-        with pytest.raises(AttributeError, match="has no attribute 'renderr_mode'; did you mean 'render_mode'"):
-            env.renderr_mode = 1
-    batch.flights_per_start = 2
-    assert batch.flights_per_start == 2
+def test_what_a_training_hands_over_is_checked(env_id):
+    """An unknown name and a bad value are named. Through wrappers, too, it holds until the next reset."""
+    for env in (make(env_id, 2), gym.make(env_id)):
+        with pytest.raises(BadInput, match="^training's flights_per_stat is 2; it must be one of flights_per_start"):
+            env.reset(options={"training": {"flights_per_stat": 2}})
+        with pytest.raises(BadInput, match="^training's flights_per_start is 0; it must be a whole number of at least"):
+            env.reset(options={"training": {"flights_per_start": 0}})
+        batch = getattr(env.unwrapped, "batch", env.unwrapped)
+        for options, held in (({"training": {"flights_per_start": 2}}, 2), (None, 1)):
+            env.reset(seed=0, options=options)
+            assert batch.training.flights_per_start == held
 
 
 @every_kind

@@ -191,8 +191,8 @@ def test_training_may_count_the_slope_from_higher_up():
     slopes = []
     for height in (2.0, 10.0, 40.0):
         batch = gym.make_vec(ID, num_envs=1)
-        batch.unwrapped.slope_height = height
-        batch.reset(options={"draw": MIDDLE, "x0": [[5.0, 0, 30.0, -5 / 6, 0, -5.0]]})
+        start = {"draw": MIDDLE, "x0": [[5.0, 0, 30.0, -5 / 6, 0, -5.0]]}
+        batch.reset(options={**start, "training": {"slope_height": height}})
         ended = np.zeros(1, dtype=bool)
         sideways = batch.r[0].copy()
         while not ended.all():
@@ -222,17 +222,16 @@ def test_a_longer_decision_is_a_repeated_command():
         assert rewards == pytest.approx(sum(other[1] for other in others))
 
 
-def test_decisions_may_be_set_before_a_reset():
-    """Decisions of 1 s that are set are those of an environment made so, and a wrong one changes nothing."""
+def test_decisions_may_be_handed_over_at_a_reset():
+    """Decisions of 1 s are those of an environment made so, and a wrong one changes nothing."""
     draw = np.random.default_rng(7).random((4, len(DRAW)))
     changed, made = gym.make_vec(ID, num_envs=4), gym.make_vec(ID, num_envs=4, decision_s=1.0)
-    changed.unwrapped.decision_s = 1.0
+    changed.reset(options={"draw": draw, "training": {"decision_s": 1.0}})
     for seconds in (0.3, 0.0, float("nan")):
-        with pytest.raises(BadInput, match="^decision_s is .*must be a multiple of 0.2 s"):
-            changed.unwrapped.decision_s = seconds
+        with pytest.raises(BadInput, match="^training's decision_s is .*must be a multiple of 0.2 s"):
+            changed.reset(options={"training": {"decision_s": seconds}})
+    made.reset(options={"draw": draw})
     assert changed.unwrapped.episode_steps == made.unwrapped.episode_steps == 100
-    for batch in (changed, made):
-        batch.reset(options={"draw": draw})
     for _ in range(5):
         assert np.array_equal(changed.advance(up(changed, 9000.0))[0], made.advance(up(made, 9000.0))[0])
 
@@ -241,9 +240,8 @@ def test_a_share_of_the_thrust_limits_commands():
     """With half of the thrust, full commands fly as half ones do; smaller ones are as they were."""
     draw = np.random.default_rng(8).random((4, len(DRAW)))
     limited_ones, free_ones = gym.make_vec(ID, num_envs=4), gym.make_vec(ID, num_envs=4)
-    limited_ones.unwrapped.thrust_share = 0.5
-    for batch in (limited_ones, free_ones):
-        batch.reset(options={"draw": draw})
+    limited_ones.reset(options={"draw": draw, "training": {"thrust_share": 0.5}})
+    free_ones.reset(options={"draw": draw})
     for asked, flown in ((24000.0, 12000.0), (9000.0, 9000.0)):
         obs = limited_ones.advance(up(limited_ones, asked))[0]
         assert np.array_equal(obs, free_ones.advance(up(free_ones, flown))[0])
@@ -252,8 +250,8 @@ def test_a_share_of_the_thrust_limits_commands():
 def test_training_may_widen_the_starts_along_x_and_y():
     draw = np.random.default_rng(9).random((4, len(DRAW)))
     wide, drawn = gym.make_vec(ID, num_envs=4), gym.make_vec(ID, num_envs=4)
-    wide.unwrapped.start_spread = 1.5
-    wide_obs, obs = (batch.reset(options={"draw": draw})[0] for batch in (wide, drawn))
+    wide_obs, _ = wide.reset(options={"draw": draw, "training": {"start_spread": 1.5}})
+    obs, _ = drawn.reset(options={"draw": draw})
     assert wide_obs[:, 0] - 1000 == pytest.approx(1.5 * (obs[:, 0] - 1000))
     assert wide_obs[:, 1] == pytest.approx(1.5 * obs[:, 1])
     assert wide_obs[:, 3] + 40 == pytest.approx(1.5 * (obs[:, 3] + 40))
@@ -265,9 +263,8 @@ def test_a_wind_sways_the_lander_to_and_fro():
     """Its velocity from the same commands differs by the integral of the sine, which is flown in periods of 0.2 s."""
     draw = np.random.default_rng(9).random((4, len(DRAW)))
     windy, calm = gym.make_vec(ID, num_envs=4), gym.make_vec(ID, num_envs=4)
-    windy.unwrapped.wind = 0.5
-    for batch in (windy, calm):
-        batch.reset(options={"draw": draw})
+    windy.reset(options={"draw": draw, "training": {"wind": 0.5}})
+    calm.reset(options={"draw": draw})
     digits = draw * 1000 % 1
     turning = 2 * np.pi / (10 + 20 * digits[:, 2])  # rad/s
     for step in range(1, 101):
@@ -354,9 +351,8 @@ def test_rewards_and_return_by_hand():
     batch = gym.make_vec(ID, num_envs=2, longest_flight=8.0).unwrapped
     prices = {"fuel_price": 3.0, "aloft_price": 7.0, "slope_price": 1.5}
     scales = {"sink_rate": 0.8, "position_scale": 0.5, "speed_scale": 0.4}
-    for name, value in (prices | scales).items():
-        setattr(batch, name, value)
-    batch.reset(options={"draw": np.repeat(MIDDLE, 2, 0), "x0": [[9, 2, 30, -0.8, 0.1, -6], [300, 0, 900, 1, 2, -3]]})
+    start = {"draw": np.repeat(MIDDLE, 2, 0), "x0": [[9, 2, 30, -0.8, 0.1, -6], [300, 0, 900, 1, 2, -3]]}
+    batch.reset(options={**start, "training": prices | scales})
 
     def of_miss(r, v, position_scale, speed_scale):
         far, fast = np.linalg.norm(r), np.linalg.norm(v)

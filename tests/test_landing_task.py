@@ -137,16 +137,17 @@ def test_the_shipped_policy_flies_as_it_did():
 def test_the_curriculum_of_our_recipe():
     """At its points: the scales follow the noise, commands are held for 1 s and at the end for 0.4 s."""
     args = script.Args(**script.MARS)
-    batch = gym.make_vec(ID, num_envs=1536, decision_s=args.decision_s, longest_flight=args.longest_flight).unwrapped
+    batch = gym.make_vec(ID, num_envs=2, decision_s=args.decision_s, longest_flight=args.longest_flight).unwrapped
     for progress, log_std, hold, fuel, slope in ((0, -1, 1.0, 4, 0), (0.6, -2.5, 1.0, 12, 1), (1, -3.6, 0.4, 12, 2)):
-        script.set_curriculum(batch, args, progress)
+        batch.reset(options={"training": script.curriculum(args, progress)})
+        flown = batch.training
         std = np.exp(log_std)
-        assert batch.position_scale == pytest.approx(max(30 * std, 0.1))
-        assert batch.speed_scale == pytest.approx(max(10 * std, 0.1))
-        assert batch.decision_s == pytest.approx(hold)
-        assert (batch.fuel_price, batch.slope_price) == (pytest.approx(fuel), pytest.approx(slope))
-    assert (batch.thrust_share, batch.start_spread, batch.wind, batch.failed_fuel_share) == (0.8, 1.9, 0.7, 0.3)
-    assert (batch.sink_rate, batch.aloft_price, batch.slope_height) == (0.8, 20.0, 10.0)
+        assert flown.position_scale == pytest.approx(max(30 * std, 0.1))
+        assert flown.speed_scale == pytest.approx(max(10 * std, 0.1))
+        assert batch.dt == pytest.approx(hold)
+        assert (flown.fuel_price, flown.slope_price) == (pytest.approx(fuel), pytest.approx(slope))
+    assert (flown.thrust_share, flown.start_spread, flown.wind, flown.failed_fuel_share) == (0.8, 1.9, 0.7, 0.3)
+    assert (flown.sink_rate, flown.aloft_price, flown.slope_height) == (0.8, 20.0, 10.0)
 
 
 def test_the_script_trains_evaluates_and_publishes(tmp_path, monkeypatch, capsys):
@@ -176,8 +177,7 @@ def test_failed_flights_may_pay_a_share_of_the_propellant():
     draw[:, 10] = 0.9, 0.1  # healthy, failed
     rewards = []
     for share in (1.0, 0.5):
-        batch.failed_fuel_share = share
-        batch.reset(options={"draw": draw})
+        batch.reset(options={"draw": draw, "training": {"failed_fuel_share": share}})
         rewards.append(batch.step(np.tile([0.0, 0.0, 0.5], (2, 1)))[1])
     assert rewards[1] == pytest.approx(rewards[0] * [1.0, 0.5], rel=1e-12)
 
@@ -186,14 +186,12 @@ def test_training_on_mars_meets_failures_of_another_size():
     """As published: of size 2 in training, of 2.5 in evaluations. Ours: more often, except where none are asked for."""
     args = script.Args(**script.MARS)
     batch = gym.make_vec(ID, num_envs=args.num_envs)
-    script.set_curriculum(batch, args, 0.0)
-    batch.reset(seed=0)
+    batch.reset(seed=0, options={"training": script.curriculum(args, 0.0)})
     assert batch.flights.failed.min() == 0.5
     assert gym.make_vec(ID, num_envs=1).failure_size == 2.5
     for asked, trained in ((None, 0.6), (0.5, 0.6), (0.0, 0.0), (1.0, 1.0)):
         args = script.Args(**script.MARS, failure_probability=asked)
-        script.set_curriculum(batch, args, 0.0)
-        assert batch.failure_probability == trained
+        assert script.curriculum(args, 0.0)["failure_probability"] == trained
 
 
 def test_a_lander_of_your_own_trains_with_the_failures_of_its_table(monkeypatch):
@@ -201,5 +199,6 @@ def test_a_lander_of_your_own_trains_with_the_failures_of_its_table(monkeypatch)
     monkeypatch.setitem(LANDERS, "Own-v0", own)
     args = script.Args(env_id="Own-v0", **script.recipe(script.Args(env_id="Own-v0")))
     batch = LanderVectorEnv(own, num_envs=8, **{name: getattr(args, name) for name in script.ENV_OPTIONS})
-    script.set_curriculum(batch, args, 0.5)
-    assert (batch.failure_probability, batch.failure_size, batch.longest_flight) == (0.3, 1.5, 80.0)
+    batch.reset(options={"training": script.curriculum(args, 0.5)})
+    failure = batch.setting("failure_probability"), batch.setting("failure_size")
+    assert (*failure, batch.longest_flight) == (0.3, 1.5, 80.0)

@@ -19,6 +19,8 @@ import evaluate
 import ppo_gtrxl_di as script
 import runs
 from benchmarks import attention, memory, run_seeds
+from common.flags import plain_args
+from common.schedule import Schedule
 
 ROOT = Path(__file__).parent.parent
 torch.set_num_threads(1)
@@ -230,7 +232,7 @@ def test_the_ablation_is_the_shipped_command_with_one_addition_off():
     """Three seeds of each row. What is off has the value of the paper's recipe, but for a rate that falls."""
     shipped = run_seeds.read_trainings(ROOT / "benchmarks" / "trainings" / "results.txt")
     shipped = {job.args["seed"]: job.args for job in shipped if job.results == Path("results/di")}
-    paper = vars(script.Args())
+    paper = plain_args(script.Args())
     jobs = run_seeds.read_trainings(ROOT / "benchmarks" / "trainings" / "ablation.txt")
     assert [job.args["seed"] for job in jobs] == [1, 2, 3] * len(ADDITIONS)
     for row, changed in ADDITIONS.items():
@@ -242,6 +244,6 @@ def test_the_ablation_is_the_shipped_command_with_one_addition_off():
             assert row == "rate_linear" or off == {name: paper[name] for name in changed}
     assert set(memory.EXPERIMENTS["../ablation"].rows) == {"../di", *ADDITIONS}
     (linear,) = {job.args["learning_rate"] for job in jobs if job.results.name == "rate_linear"}
-    found = [script.value_at(linear, progress) for progress in (0.0, 1.0)]
-    std = np.exp([script.value_at(shipped[1]["log_std"], progress) for progress in (0.0, 1.0)])
+    found = [Schedule(linear).at(progress) for progress in (0.0, 1.0)]
+    std = np.exp([Schedule(shipped[1]["log_std"]).at(progress) for progress in (0.0, 1.0)])
     np.testing.assert_allclose(found, shipped[1]["learning_rate"] * std, rtol=0.02)  # the shipped rate's ends

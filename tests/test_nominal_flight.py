@@ -1,4 +1,4 @@
-"""Dispersed flights beside the nominal one: what `before_training` keeps of it, how it is looked up, what is seen."""
+"""Dispersed flights beside the nominal one: what `show_differences` keeps of it, how it is looked up, what is seen."""
 
 import copy
 from dataclasses import replace
@@ -10,7 +10,6 @@ import torch
 
 import ppo_gtrxl_rocket as script
 from envs import ROCKETS, Burn, register_rocket, target_axes, target_orbit
-from rocket.policy_constants import policy_constants
 
 CUTOFF = "RocketAscentCutoff-v0"
 SMALL = {"embed_dim": 8, "num_heads": 2, "mlp_dim": 8, "hidden_dim": 8, "num_blocks": 1, "memory_length": 4}
@@ -153,13 +152,13 @@ def test_what_comes_into_sight_changes_nothing_at_first(observe_draw):
     blind = obs.clone()
     blind[..., 9:] = 0.0  # as nominal flights show it
     before = agent.encode(blind, memory)
-    script.before_training(agent, args, env_options)
+    script.show_differences(agent, args, env_options)
     torch.testing.assert_close(agent.encode(obs, memory), before, rtol=0, atol=0)
-    assert agent.nominal_flight.any()
+    assert script.has_nominal_flight(agent)
     with torch.no_grad():
         agent.encoder[0].weight[:, -8:] = 0.5
     kept = agent.nominal_flight.clone()
-    script.before_training(agent, args, env_options)  # a policy that has its nominal flight keeps it
+    script.show_differences(agent, args, env_options)  # a policy that has its nominal flight keeps it
     assert (agent.encoder[0].weight[:, -8:] == 0.5).all() and torch.equal(agent.nominal_flight, kept)
 
 
@@ -173,7 +172,7 @@ def test_before_a_training_with_failures_larger_differences_come_into_sight(flow
     seen = torch.as_tensor(fly(climb, 8, dispersion=1.0)[0]).flatten(0, 1)
     narrow = script.features(agent, seen)
     before = agent.encoder(narrow)
-    script.before_training(agent, args, env_options)
+    script.show_differences(agent, args, env_options)
     wide = script.features(agent, seen)
 
     as_before = (narrow[:, -8:].abs() < 10).all(dim=-1)
@@ -184,7 +183,7 @@ def test_before_a_training_with_failures_larger_differences_come_into_sight(flow
     torch.testing.assert_close(2 * wide[in_sight, 36], narrow[in_sight, 36], rtol=1e-5, atol=0)
     assert (10 * wide[:, -8:-2]).abs().max() > 20  # no longer clipped at 10 of the narrow sizes
     once = copy.deepcopy(agent.state_dict())
-    script.before_training(agent, args, env_options)
+    script.show_differences(agent, args, env_options)
     for name, tensor in agent.state_dict().items():
         assert torch.equal(tensor, once[name]), name
 
@@ -196,7 +195,7 @@ def test_nothing_is_flown_where_no_dispersed_training_begins(changes):
     agent, args, env_options = make_agent()
     vars(args).update(changes)
     before = {name: tensor.clone() for name, tensor in agent.state_dict().items()}
-    script.before_training(agent, args, env_options)
+    script.show_differences(agent, args, env_options)
     for name, tensor in agent.state_dict().items():
         assert torch.equal(tensor, before[name]), name
 
@@ -204,12 +203,12 @@ def test_nothing_is_flown_where_no_dispersed_training_begins(changes):
 def test_the_policy_itself_flies_it():
     """By its mean action, nominal vehicle and all."""
     agent, args, env_options = make_agent()
-    script.before_training(agent, args, env_options)
+    script.show_differences(agent, args, env_options)
     agent.nominal_flight.zero_()
     script.fly_nominal(agent, agent.make_policy(481), gym.make_vec(CUTOFF, num_envs=1, action_frame="local"))
     kept = agent.nominal_flight.clone()
     again, _, _ = make_agent()
-    script.before_training(again, args, env_options)
+    script.show_differences(again, args, env_options)
     torch.testing.assert_close(again.nominal_flight, kept, rtol=1e-5, atol=1e-5)
 
 
@@ -219,7 +218,6 @@ def test_in_a_coast_flights_are_compared_with_its_beginning():
     first, second = two_stages.burns
     burns = (first, Burn(300.0, second.engines), Burn(600.0, ()), Burn(693.0, second.engines))
     register_rocket("Restart-v0", replace(two_stages, burns=burns, end_time=693.0), cutoff=True)
-    script.BUFFERS["Restart-v0"] = policy_constants(ROCKETS["Restart-v0"].rocket)
     try:
         agent, *_ = make_agent(env_id="Restart-v0")
         envs = gym.make_vec("Restart-v0", num_envs=1, action_frame="local")
@@ -233,5 +231,5 @@ def test_in_a_coast_flights_are_compared_with_its_beginning():
         np.testing.assert_array_equal(found, coast[:1, 2:].expand(5, -1))
         np.testing.assert_allclose(coast[:, 2:9], coast[:1, 2:9].expand(len(coast), -1), atol=2e-6)
     finally:
-        for registry in (script.BUFFERS, ROCKETS, gym.registry):
+        for registry in (ROCKETS, gym.registry):
             del registry["Restart-v0"]

@@ -423,7 +423,7 @@ def test_a_policys_process_flies_the_draws_that_were_asked_for():
     assert about["knows"] == "draws in training" and about["decision_us"] > 0
 
     argv = ["--eval-only", f"--checkpoint={path}"]
-    args, _ = runs.parse_args(script.Args, script.recipe, argv, script.ENV_OPTIONS, script.BUFFERS)
+    args, _ = runs.parse_args(script, argv)
     options = (
         {name: getattr(args, name) for name in script.ENV_OPTIONS} | script.FIXED_OPTIONS | {"dispersion": dispersion}
     )

@@ -9,6 +9,7 @@ import pytest
 
 import ppo_gtrxl_rocket
 from benchmarks import peers
+from common.schedule import Schedule
 
 
 def trained(folder, name, seed, **final):
@@ -84,4 +85,4 @@ def test_every_command_is_one_that_the_script_takes(monkeypatch):
 def test_the_dispersed_row_has_the_noise_of_ours():
     """That with which our recipe begins; the mass is paid for in another way."""
     theirs = float(re.search(r"--log-std (\S+)", peers.PEERS["lstm_dispersed"].flags)[1])
-    assert ppo_gtrxl_rocket.value_at(ppo_gtrxl_rocket.DISPERSED["log_std"], 0.0) == theirs
+    assert Schedule(ppo_gtrxl_rocket.DISPERSED["log_std"]).at(0.0) == theirs

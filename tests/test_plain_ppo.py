@@ -30,7 +30,7 @@ def between(first, last, update):
 
 def fly(agent, envs, args):
     """One episode in each environment: the memory before them, and for each a list of (obs, action, log pi, V, r)."""
-    memory = agent.new_memory(envs.num_envs, args.memory_noise)
+    memory = agent.new_memory(envs.num_envs, args.memory_noise.at(0.0))
     episodes = [[] for _ in range(envs.num_envs)]
     flying = set(range(envs.num_envs))
     obs, _ = envs.reset()
@@ -57,7 +57,7 @@ def advantages_of(episode, args):
     next_value = next_advantage = 0.0
     for _, _, _, value, reward in reversed(episode):
         delta = reward + args.gamma * next_value - value
-        advantage = delta + args.gamma * args.gae_lambda * next_advantage
+        advantage = delta + args.gamma * args.gae_lambda.at(0.0) * next_advantage
         advantages.insert(0, advantage)
         next_value = value
         next_advantage = advantage
@@ -133,7 +133,7 @@ def test_table_1_is_plain_ppo(name):
 
 def test_episodes_of_different_lengths(uneven_envs, monkeypatch):
     """An episode that has ended weighs nothing more, in the advantages, their normalisation and the loss."""
-    monkeypatch.setattr(ppo_gtrxl_di, "set_curriculum", lambda *inputs: 1)  # these environments have none
+    monkeypatch.setattr(ppo_gtrxl_di, "curriculum", lambda *inputs: {"flights_per_start": 1})
     args = ppo_gtrxl_di.Args(total_updates=UPDATES, **TINY)
     check(ppo_gtrxl_di, args, lambda: uneven_envs((6, 2, 5, 1, 6, 3, 4)))
 

@@ -1,6 +1,6 @@
 """PPO of the scripts: GAE, groups, loss, update, schedules against sums, cases and averages written out by hand.
 
-The scripts' shared sections are the same to the letter (test_scripts.py), so one script stands for all.
+The scripts' shared sections are the same (test_scripts.py), so one script stands for all.
 """
 
 import copy
@@ -17,6 +17,7 @@ from scipy.stats import norm
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 import ppo_gtrxl_di as script
+from common.schedule import Schedule
 
 torch.set_num_threads(1)
 TINY = {"embed_dim": 8, "num_heads": 2, "mlp_dim": 8, "hidden_dim": 8, "num_blocks": 1, "memory_length": 4}
@@ -50,14 +51,14 @@ class Learner:
 
     def __init__(self, envs, **changes):
         self.args, self.envs = make_args(**changes), envs
-        envs.flights_per_start = self.args.flights_per_start
+        envs.flights_per_start = round(self.args.flights_per_start.at(0.0))
         self.agent = make_agent(self.args, envs)
         self.average = AveragedModel(self.agent, multi_avg_fn=get_ema_multi_avg_fn(0.9))
         self.optimizer = RecordingAdam(self.agent)
         self.collect()
 
     def collect(self):
-        self.batch, _ = script.rollout(self.agent, self.envs, 1.0, 0.1)
+        self.batch, _ = script.rollout(self.agent, self.envs, {}, 1.0, 0.1)
 
     def update(self, iteration=1):
         modules = self.agent, self.average, self.optimizer
@@ -113,12 +114,36 @@ def test_gae_is_the_direct_sum(gamma, lam):
 
 def test_schedule_is_linear_between_its_points():
     """Of two points at one place the second counts from there on; before the first and after the last: constant."""
-    schedule = "0.1:1 0.4:-2 0.4:8 0.9:3"
+    schedule = Schedule("0.1:1 0.4:-2 0.4:8 0.9:3")
     expected = {0.0: 1, 0.1: 1, 0.2: 0, 0.3: -1, 0.399: -1.99, 0.4: 8, 0.65: 5.5, 0.9: 3, 1.0: 3}
     for progress, value in expected.items():
-        assert script.value_at(schedule, progress) == pytest.approx(value), progress
-    assert script.value_at("0:3e-4 1:3e-5", 0.0) == 3e-4 and script.value_at("0:3e-4 1:3e-5", 1.0) == 3e-5
-    assert script.value_at(0.7, 0.3) == 0.7
+        assert schedule.at(progress) == pytest.approx(value), progress
+    updates = 21
+    found = schedule.over(updates)
+    np.testing.assert_array_equal(found, [schedule.at(k / (updates - 1)) for k in range(updates)])
+    assert Schedule("0:3e-4 1:3e-5").at(0.0) == 3e-4 and Schedule("0:3e-4 1:3e-5").at(1.0) == 3e-5
+    assert Schedule(0.7).at(0.3) == 0.7
+
+
+@pytest.mark.parametrize("plain", [1, 0.95, -1.4, 3e-4, "0:3e-4 1:3e-5", "0:-1"])
+def test_a_file_holds_a_schedule_as_number_or_words(plain):
+    """Read again it is the same schedule. One point is not a number: it is set where a number is learned."""
+    schedule = Schedule(plain)
+    assert schedule.plain == plain and type(schedule.plain) is type(plain)
+    assert Schedule(schedule.plain) == Schedule(str(schedule)) == Schedule(schedule) == schedule
+    assert schedule.has_points == (":" in str(plain))
+    assert Schedule("0:-1") != Schedule(-1) and Schedule(1) == Schedule(1.0)
+
+
+@pytest.mark.parametrize("words", ["", "x", "0:1 x", "0.5:1 0:2", "0:1 2:3", "-0.1:1", "nan:1", "0:1:2", "1 2"])
+def test_words_that_are_no_schedule(words):
+    with pytest.raises(ValueError, match=f"^{words}: must be a number, or points as 0:-1 0.4:-2 1:-6 whose places ris"):
+        Schedule(words)
+
+
+def test_a_lowered_group_keeps_its_places():
+    assert str(Schedule("0:1 0.4:1 0.4:8").replaced(8, 4)) == "0:1 0.4:1 0.4:4"
+    assert Schedule(32).replaced(32, 4) == Schedule(4)
 
 
 @pytest.mark.parametrize("name, env_id, first", [
@@ -127,9 +152,9 @@ def test_schedule_is_linear_between_its_points():
 ])  # fmt: skip
 def test_radius_curriculum(name, env_id, first):
     """From about K times the radius, geometrically, to the true one; from there on a tenth less, flown in groups."""
-    script, envs = importlib.import_module(name), gym.make_vec(env_id, num_envs=1)
-    args = script.Args(**script.RECIPES[env_id])
-    refined = float(args.log_radius.split()[-2].split(":")[0])
+    script = importlib.import_module(name)
+    args = script.Args(env_id=env_id, **script.RECIPES[env_id])
+    refined = args.log_radius.places[-2]
     for progress, scale in (
         (0.0, first),
         (refined / 2, first**0.5),
@@ -137,12 +162,13 @@ def test_radius_curriculum(name, env_id, first):
         (refined, 0.9),
         (1.0, 0.9),
     ):
-        group = script.set_curriculum(envs, args, progress)
-        assert envs.radius_scale == pytest.approx(scale, rel=0.02)
-        assert envs.bonus_width == (0.4 if progress >= refined else 0.0)
-        assert group == envs.flights_per_start == (8 if progress >= refined else 1)
-    assert script.set_curriculum(envs, script.Args(), 0.7) == 1  # the paper
-    assert envs.radius_scale == 1 and envs.bonus_width == 0
+        training = script.curriculum(args, progress)
+        assert training["radius_scale"] == pytest.approx(scale, rel=0.02)
+        assert training["bonus_width"] == (0.4 if progress >= refined else 0.0)
+        assert training["flights_per_start"] == (8 if progress >= refined else 1)
+    paper = script.curriculum(script.Args(env_id=env_id), 0.7)
+    assert paper == {"flights_per_start": 1, "radius_scale": 1, "bonus_width": 0}
+    assert script.curriculum(script.Args(), 0.7) == {"flights_per_start": 1}  # no circles
 
 
 @pytest.mark.parametrize("std, dispersion, scale", [
@@ -150,13 +176,13 @@ def test_radius_curriculum(name, env_id, first):
 ])  # fmt: skip
 def test_the_rockets_curriculum(std, dispersion, scale):
     """R_terminal's scale is an eighth of the noise, within its bounds; guidance and groups are those of the flags."""
-    rocket, envs = importlib.import_module("ppo_gtrxl_rocket"), gym.make_vec("RocketAscentCutoff-v0", num_envs=1)
+    rocket = importlib.import_module("ppo_gtrxl_rocket")
     log_std = f"0:0.2 0.5:{math.log(std)} 1:-7"
     args = rocket.Args(guidance=True, flights_per_start=16, dispersion=dispersion, log_std=log_std)
-    assert rocket.set_curriculum(envs, args, 0.5) == envs.flights_per_start == 16
-    assert envs.guidance and envs.terminal_scale == pytest.approx(scale)
-    rocket.set_curriculum(envs, rocket.Args(), 0.5)  # the paper
-    assert envs.flights_per_start == 1 and envs.terminal_scale == 0.005 and not envs.guidance
+    training = rocket.curriculum(args, 0.5)
+    assert training == {"flights_per_start": 16, "guidance": True, "terminal_scale": pytest.approx(scale)}
+    paper = rocket.curriculum(rocket.Args(), 0.5)
+    assert paper == {"flights_per_start": 1, "guidance": False, "terminal_scale": 0.005}
 
 
 @pytest.mark.parametrize("asked", ["random", "ignition"])
@@ -167,8 +193,7 @@ def test_every_second_update_of_random_failures_flies_those_at_the_last_ignition
     envs = gym.make_vec("RocketAscentCutoff-v0", num_envs=40, **options)
     args = rocket.Args(**options, total_updates=300)
     for before in (*range(6), 298, 299):
-        rocket.set_curriculum(envs, args, before / 299)
-        envs.reset(seed=before)
+        envs.reset(seed=before, options={"training": rocket.curriculum(args, before / 299)})
         groups, moments, _ = envs.unwrapped.vehicles.failure[:, envs.unwrapped.vehicles.failure[0] >= 0]
         at_ignition = set(groups) == {3} and np.ptp(moments) == 0
         assert at_ignition == (asked == "ignition" or before % 2 == 1)
@@ -209,13 +234,12 @@ def test_memory_noise_half_way(learner, monkeypatch):
     class Asked(Exception):
         pass
 
-    def rollout(agent, envs, reward_scale, memory_noise):
+    def rollout(agent, envs, training, reward_scale, memory_noise):
         raise Asked(memory_noise)
 
     def of_update(iteration, **changes):
         run, start = learner(total_updates=11, **changes), SimpleNamespace(updates_done=iteration - 1)
         with monkeypatch.context() as patch, pytest.raises(Asked) as asked:
-            patch.setattr(script, "set_curriculum", lambda *inputs: 1)
             patch.setattr(script, "rollout", rollout)
             script.train(run.args, run.agent, run.average, run.optimizer, run.envs, start)
         return asked.value.args[0]
@@ -349,8 +373,7 @@ def test_flights_of_a_group_share_their_start_and_nothing_else(env_id):
     args = make_args(env_id=env_id, flights_per_start=3)
     envs = gym.make_vec(env_id, num_envs=6)
     envs.reset(seed=1)
-    script.set_curriculum(envs, args, 0.0)
-    batch, _ = script.rollout(make_agent(args, envs), envs, 1.0, 0.1)
+    batch, _ = script.rollout(make_agent(args, envs), envs, script.curriculum(args, 0.0), 1.0, 0.1)
     first, second = batch.obs[0, :3], batch.obs[0, 3:]
     assert (first == first[0]).all() and (second == second[0]).all() and (first[0, :2] != second[0, :2]).all()
     for own in (batch.actions[0, :, 0], batch.logprobs[0], batch.obs[1, :, 1], batch.rewards[1]):
@@ -517,7 +540,7 @@ def test_rewards_are_scaled_in_training_and_logged_unscaled():
     args = make_args()
     envs = gym.make_vec(args.env_id, num_envs=3)
     envs.reset(seed=1)
-    batch, episodes = script.rollout(make_agent(args, envs), envs, 0.1, 0.1)
+    batch, episodes = script.rollout(make_agent(args, envs), envs, {}, 0.1, 0.1)
     assert batch.rewards.shape == (50, 3) and batch.alive.all()
     np.testing.assert_allclose(batch.rewards.sum(0) / 0.1, episodes["episodic_return"], rtol=1e-9)
     x, v, u = batch.obs[..., 0], batch.obs[..., 1], batch.actions[..., 0].clip(-4, 4)

@@ -241,8 +241,7 @@ def test_hidden_parameters_are_drawn(new_problem):
     assert obs.shape == (2, 3) and seen.shape == (2, 5)
     np.testing.assert_array_equal(seen[:, 3:], shown.draw)
     np.testing.assert_allclose(seen[:, 0], 1.0 + 0.1 * seen[:, 4], rtol=1e-15)
-    shown.flights_per_start = 2
-    shown.reset(seed=4)
+    shown.reset(seed=4, options={"training": {"flights_per_start": 2}})
     assert (shown.draw[0] == shown.draw[1]).all()
     one = gym.make(env_id)
     assert one.reset(options={"draw": [0.0, 2.0]})[0][0] == pytest.approx(1.2)
@@ -254,14 +253,6 @@ def test_scores_of_a_seed_are_standard_and_clipped():
     _, z = flights_of_seed(drawn("Scores-v0"), 0, 4000)
     assert np.abs(z).max() == 3.0 and abs(z.mean()) < 0.03 and z.std() == pytest.approx(0.998, abs=0.01)
     np.testing.assert_allclose(envs.uniform(z[:, 0], -2, 5), -2 + 7 * norm.cdf(z[:, 0]))
-
-
-def test_the_command_of_the_step_before_is_shown(new_problem):
-    env_id = new_problem(free_fall("Command-v0"))
-    batch = gym.make_vec(env_id, num_envs=1, observe_command=True)
-    assert batch.reset(seed=0)[0][0, -1] == 0
-    assert batch.step(np.array([[99.0]]))[0][0, -1] == 30.0  # as it was applied
-    assert batch.reset()[0][0, -1] == 0
 
 
 def test_velocities_can_be_hidden():

@@ -20,6 +20,7 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 import ppo_gtrxl_di as script
 import runs
+from common.schedule import Schedule
 
 pytestmark = pytest.mark.slow
 
@@ -31,7 +32,7 @@ NETWORK = [f"--{name.replace('_', '-')}={value}" for name, value in SIZES.items(
 
 def batch_of(envs, agent):
     torch.manual_seed(1)
-    return script.rollout(agent, envs, 1.0, 0.1)
+    return script.rollout(agent, envs, {}, 1.0, 0.1)
 
 
 def share(batch, episodes):
@@ -47,7 +48,7 @@ def learn(rank, world, folder, settings, meeting=None):
     settings = {"learning_rate": 1e-3, **settings}
     args = script.Args(**SIZES, num_minibatches=2, update_epochs=2, **settings)
     envs = UnevenEnvs(LENGTHS)
-    envs.num_envs, envs.flights_per_start = len(LENGTHS) // world, args.flights_per_start
+    envs.num_envs, envs.flights_per_start = len(LENGTHS) // world, round(args.flights_per_start.at(0.0))
     torch.manual_seed(0)
     agent = script.Agent(args, envs)
     batch = torch.load(f"{folder}/batch.pt", weights_only=False)
@@ -272,7 +273,7 @@ def test_processes_draw_other_noise(monkeypatch):
 
 
 def parse(*argv):
-    return runs.parse_args(script.Args, script.recipe, argv, script.ENV_OPTIONS, script.BUFFERS)[0]
+    return runs.parse_args(script, argv)[0]
 
 
 def test_processes_fly_starts_of_their_own(monkeypatch):
@@ -297,14 +298,14 @@ def test_every_process_flies_whole_groups(monkeypatch):
     monkeypatch.setenv("WORLD_SIZE", "2")
     with pytest.raises(SystemExit, match="--flights-per-start 4: must divide --num-envs 12 / 2 processes"):
         parse("--num-envs=12", "--flights-per-start=4")
-    assert parse("--num-envs=12", "--flights-per-start=3").flights_per_start == 3
+    assert parse("--num-envs=12", "--flights-per-start=3").flights_per_start == Schedule(3)
 
 
 def test_shares_of_different_sizes(monkeypatch):
     """Without groups three and two environments are as good as any."""
     monkeypatch.setenv("WORLD_SIZE", "2")
-    assert parse("--num-envs=5", "--recipe=paper").flights_per_start == 1
-    assert parse("--num-envs=5").flights_per_start == "0:1 0.4:1 0.4:1"  # lowered from 8
+    assert parse("--num-envs=5", "--recipe=paper").flights_per_start == Schedule(1)
+    assert str(parse("--num-envs=5").flights_per_start) == "0:1 0.4:1 0.4:1"  # lowered from 8
 
 
 def test_moments_are_those_of_the_living(monkeypatch):

@@ -30,7 +30,7 @@ from rocket_oracle import (
     unit,
 )
 
-from envs import Rocket, RocketVectorEnv, fly_rocket
+from envs import BadInput, Rocket, RocketVectorEnv, fly_rocket
 
 REGISTERED, IDS = [FIXED, CUTOFF, LEO], [FIXED, CUTOFF, LEO_FIXED, LEO]
 KEYS = {
@@ -116,8 +116,7 @@ def test_local_actions_are_eci_actions_rotated_at_the_steps_start(env_id):
 )
 def test_fly_rocket_records_the_flight(env_id, end_time):
     v = VEHICLES[env_id]
-    envs = make(env_id, action_frame="local")
-    envs.unwrapped.end_time = end_time or v.end
+    envs = make(env_id, action_frame="local", end_time=end_time)
     seen, rewards, final = fly(envs, lambda obs, t: 3 * v.programme(2 * t))
     flight = fly_rocket(env_id, lambda obs, t: 3 * v.programme(2 * t)[None], end_time, action_frame="local")
     np.testing.assert_array_equal(flight["y"], seen[:, :7])
@@ -381,10 +380,7 @@ FLIGHTS_OF_TWO_STAGES = [(163.0, 82)]
 @pytest.mark.parametrize("alone", [False, True])
 def test_end_time(v, end_time, steps, alone):
     u, y, _ = v.reference(False)
-    env = single(v.fixed) if alone else make(v.fixed)
-    assert env.unwrapped.end_time == v.end
-    env.unwrapped.end_time = end_time
-    assert env.unwrapped.end_time == end_time
+    env = single(v.fixed, end_time=end_time) if alone else make(v.fixed, end_time=end_time)
     assert (env.unwrapped.batch if alone else env.unwrapped).episode_steps == steps
     if alone:
         env.reset()
@@ -406,19 +402,17 @@ def test_end_time(v, end_time, steps, alone):
 def test_bad_end_times_are_refused(v, value):
     if value == 555.1 and v is PAPER:
         pytest.skip("within its 961 s")
-    for env in (make(v.fixed, 2), gym.make(v.cutoff)):
-        with pytest.raises(ValueError, match=rf"end_time is {value} "):
-            env.unwrapped.end_time = value
-        assert env.unwrapped.end_time == v.end
+    for make_env in (lambda: make(v.fixed, 2, end_time=value), lambda: gym.make(v.cutoff, end_time=value)):
+        with pytest.raises(BadInput, match=rf"end_time is {value} s; it must be positive and at most {v.end}"):
+            make_env()
 
 
 @pytest.mark.parametrize("v, end_time", [(PAPER, 100.0), (PAPER, 200.0), (TWO_STAGE, 160.0)])
 def test_short_flights_know_no_last_phase(v, end_time, monkeypatch):
     """Neither the mass term nor the cut-off act before the last phase, where the training ends the episode before."""
     monkeypatch.setattr(Rocket, "target_energy", -MU / (2 * 3.3e6))
-    envs = make(v.cutoff, action_frame="local")
-    envs.unwrapped.end_time, envs.unwrapped.mass_weight = end_time, 1.0
-    *_, final = fly(envs, lambda obs, t: v.programme(2 * t))
+    envs = make(v.cutoff, action_frame="local", end_time=end_time)
+    *_, final = fly(envs, lambda obs, t: v.programme(2 * t), mass_weight=1.0)
     assert final["final_time_s"] == end_time
     assert final["R_penalties"] > -1
 

@@ -13,19 +13,18 @@ from rocket_oracle import (
     TWO_STAGE,
     VEHICLES,
     both,
-    energy,
     fly,
     make,
     single,
 )
 
-from envs import ROCKETS, Mission
+from envs import ROCKETS, BadInput, Mission
 from rocket.rewards import (
     penalties,
 )
 
 
-def expected_parts(v, floor, seen, u, final, mass_weight, trajectory_weight, guidance_weight, knots):
+def expected_parts(v, floor, seen, u, final, mass_weight, knots):
     """The five parts (K, 5) of each step of a flight, from the formulas' words, by a plain loop."""
     parts = np.zeros((len(u), 5))
     for k in range(len(u)):
@@ -33,12 +32,10 @@ def expected_parts(v, floor, seen, u, final, mass_weight, trajectory_weight, gui
         end = final["final_time_s"] if k == len(u) - 1 else begin + 2
         altitude = np.linalg.norm(after[:3]) - RE
         parts[k, 0] = 10 * (np.abs(v.goal_errors(before)).sum() - np.abs(v.goal_errors(after)).sum())
-        if begin < v.last_ignition:
-            parts[k, 1] = trajectory_weight * (energy(after) - energy(before)) / 1e6
         if knots and begin <= v.guided_until:
             pitch = math.radians(np.interp(begin, *knots))
             up, along, _ = v.up_along_cross(before)
-            parts[k, 2] = -guidance_weight * (1 - u[k] @ (math.sin(pitch) * up + math.cos(pitch) * along))
+            parts[k, 2] = -0.1 * (1 - u[k] @ (math.sin(pitch) * up + math.cos(pitch) * along))
         parts[k, 3] -= 40 * (altitude < 0) * (2 - end / v.end)
         parts[k, 3] -= 0.024 * min(max((altitude - v.ceiling + 5e3) / 100e3, 0), 1)
         if end > 300:
@@ -56,7 +53,7 @@ def expected_parts(v, floor, seen, u, final, mass_weight, trajectory_weight, gui
 
 KNOTS = ([0, 10, 40, 75.2, 150.4], [90, 88, 72, 55, 35])
 KNOTS_OF_TWO_STAGES = ([0, 10.77127660, 43.08510638, 81, 162], [90, 88, 72, 55, 35])  # its 162 s for the paper's 150.4
-ALL_WEIGHTS = {"guidance": True, "mass_weight": 0.3, "trajectory_weight": 0.7, "guidance_weight": 0.2}
+ALL_WEIGHTS = {"guidance": True, "mass_weight": 0.3}
 
 
 @pytest.mark.slow
@@ -74,19 +71,12 @@ ALL_WEIGHTS = {"guidance": True, "mass_weight": 0.3, "trajectory_weight": 0.7, "
 def test_rewards_follow_the_formulas(env_id, steering, weights, knots):
     v = VEHICLES[env_id]
     envs = make(env_id, action_frame="local")
-    defaults = {"mass_weight": 0.0, "trajectory_weight": 0.0, "guidance_weight": 0.1}
-    for name, value in defaults.items():
-        assert getattr(envs.unwrapped, name) == value
-    assert envs.unwrapped.guidance is False
-    for name, value in weights.items():
-        setattr(envs.unwrapped, name, value)
     actions = []
     steer = lambda obs, t: actions.append(v.steering[steering](obs, t)) or actions[-1]  # noqa: E731
-    seen, rewards, final = fly(envs, steer)
+    seen, rewards, final = fly(envs, steer, **weights)
     u = np.array([np.array(a) / np.linalg.norm(a) @ v.up_along_cross(s) for a, s in zip(actions, seen)])
-    numbers = {name: weights.get(name, value) for name, value in defaults.items()}
     floor = 130e3 if env_id == FIXED else 110e3
-    parts = expected_parts(v, floor, seen, u, final, **numbers, knots=knots)
+    parts = expected_parts(v, floor, seen, u, final, weights.get("mass_weight", 0.0), knots)
     np.testing.assert_allclose(rewards, parts.sum(axis=1), rtol=1e-10, atol=1e-11)
     got = [final[name] for name in PARTS]
     np.testing.assert_allclose(got, parts.sum(axis=0), rtol=1e-10, atol=1e-10)
@@ -109,9 +99,8 @@ def test_guidance_is_exactly_zero_after_its_time(v):
     """Two flights, with and without: what they pay for each step is the same to the bit from then on."""
     pay = []
     for guidance in (True, False):
-        envs = make(v.fixed, action_frame="local")
-        envs.unwrapped.guidance, envs.unwrapped.end_time = guidance, 400.0
-        pay.append(fly(envs, lambda obs, t: v.programme(2 * t))[1])
+        envs = make(v.fixed, action_frame="local", end_time=400.0)
+        pay.append(fly(envs, lambda obs, t: v.programme(2 * t), guidance=guidance)[1])
     different = np.flatnonzero(pay[0] != pay[1])
     assert (v.grid[different] <= v.guided_until).all() and len(different) > 70
 
@@ -131,30 +120,22 @@ def test_penalties_are_the_missions_by_hand():
 @both
 def test_weights_of_the_single_environment(v):
     returns = {}
-    changes = {"mass_weight": 2.0, "trajectory_weight": 0.5, "guidance": True, "guidance_weight": 5.0}
+    changes = {"mass_weight": 2.0, "guidance": True}
     for name, value in changes.items():
-        env = single(v.fixed, action_frame="local")
-        if name == "guidance_weight":
-            env.unwrapped.guidance = True
-        setattr(env.unwrapped, name, value)
-        assert getattr(env.unwrapped, name) == value
-        env.unwrapped.end_time = 400.0
-        env.reset()
+        env = single(v.fixed, action_frame="local", end_time=400.0)
+        env.reset(options={"training": {name: value}})
         steps = [env.step(v.programme(2 * t)) for t in range(200)]
         returns[name] = steps[-1][4]
         assert steps[-1][4]["episodic_return"] == pytest.approx(sum(step[1] for step in steps), abs=1e-10)
-    envs = make(v.fixed, action_frame="local")
-    envs.unwrapped.end_time = 400.0
+    envs = make(v.fixed, action_frame="local", end_time=400.0)
     plain = fly(envs, lambda obs, t: v.programme(2 * t))[2]
     burnt = v.last_flow * (400 - (162 if v is TWO_STAGE else 262))  # by steps that begin in the last phase
     assert returns["mass_weight"]["R_penalties"] - plain["R_penalties"] == pytest.approx(
         -2 * burnt / v.mass_unit, abs=1e-9
     )
-    assert returns["trajectory_weight"]["R_trajectory"] > 1
-    assert returns["guidance_weight"]["R_guidance"] == pytest.approx(50 * returns["guidance"]["R_guidance"])
     for changed, final in returns.items():
         for part in PARTS:
-            affected = {"mass_weight": "R_penalties", "trajectory_weight": "R_trajectory"}.get(changed, "R_guidance")
+            affected = {"mass_weight": "R_penalties", "guidance": "R_guidance"}[changed]
             assert (final[part] == plain[part]) == (part != affected), (changed, part)
 
 
@@ -164,9 +145,8 @@ def test_terminal_scale_changes_only_the_last_reward(env_id, steering):
     pay, finals = [], []
     for scale in (0.005, 0.0005, 0.02):
         envs = make(env_id, action_frame="local")
-        assert envs.unwrapped.terminal_scale == 0.005
-        envs.unwrapped.terminal_scale = scale
-        _, rewards, final = fly(envs, v.steering[steering])
+        assert envs.unwrapped.training.terminal_scale == 0.005
+        _, rewards, final = fly(envs, v.steering[steering], terminal_scale=scale)
         pay.append(rewards)
         finals.append(final)
     d = finals[0]["error_norm"]
@@ -183,6 +163,5 @@ def test_terminal_scale_changes_only_the_last_reward(env_id, steering):
 @pytest.mark.parametrize("scale", [0.0, -0.005, math.nan, math.inf])
 def test_bad_terminal_scales_are_refused(maker, scale):
     env = maker(FIXED)
-    env.unwrapped.terminal_scale = scale
-    with pytest.raises(ValueError, match=f"terminal_scale is {scale}; it must be positive and finite"):
-        env.reset()
+    with pytest.raises(BadInput, match=f"terminal_scale is {scale}; it must be a number of at least 1e-12"):
+        env.reset(options={"training": {"terminal_scale": scale}})

@@ -101,9 +101,9 @@ def test_native_batch_keeps_the_interface():
     assert np.array_equal(batch.reset(), first) and (first != second).any() and first.dtype == np.float32
     assert [image.shape for image in batch.get_images()] == [(450, 800, 3)] * 3
     assert batch.get_attr("num_envs") == [3] * 3 and batch.get_attr("num_envs", [0, 2]) == [3] * 2
-    assert batch.has_attr("radius_scale") and not batch.has_attr("no_such")
-    batch.set_attr("radius_scale", 2.0)
-    assert batch.batch.radius_scale == 2.0 and batch.env_is_wrapped(gym.Wrapper, 1) == [False]
+    assert batch.has_attr("training") and not batch.has_attr("no_such")
+    batch.set_attr("spec", None)
+    assert batch.batch.spec is None and batch.env_is_wrapped(gym.Wrapper, 1) == [False]
 
 
 def test_the_benchmark_shows_what_our_encoder_sees():
@@ -142,7 +142,7 @@ def test_the_benchmark_follows_our_curriculum():
     class Watch(sb3_ppo.OurCurriculum):
         def _on_rollout_start(self):
             super()._on_rollout_start()
-            prices.append((batch.mass_weight, batch.flights_per_start))
+            prices.append((batch.training.mass_weight, batch.training.flights_per_start))
 
     model.learn(64, callback=Watch(script, args, batch, 64))
     assert prices == [(pytest.approx(price), 1) for price in (0, 0, 3 * 0.25 / 0.35, 3 * (1 - 0.9 * 0.15 / 0.4))]
@@ -193,7 +193,7 @@ def test_the_benchmarks_dispersed_run(tmp_path, monkeypatch):
 
     def keep_model(options, script, args, *rest):
         model = make_model(options, script, args, *rest)
-        made.append((args.mass_weight, args.dispersion, model.policy.log_std.detach().tolist()))
+        made.append((args.mass_weight.at(0.0), args.dispersion, model.policy.log_std.detach().tolist()))
         return model
 
     def keep_evaluation(env_id, policy, eval_seed, n, **options):

@@ -18,6 +18,7 @@ import time
 import types
 from pathlib import Path
 from types import SimpleNamespace
+from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
@@ -29,7 +30,9 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 import baselines
 import envs
 import runs
-from common.errors import NoOptimum
+from common.errors import BadInput, NoOptimum
+from common.flags import Range, facts, plain_args
+from common.schedule import Schedule
 from drawing import animation
 from phased.task import PhasedTask
 
@@ -53,7 +56,7 @@ TINY = [*NETWORK, "--num-envs=2", "--num-minibatches=2", "--update-epochs=2", "-
 
 def parse(*argv, script=DI):
     """A script's checked arguments."""
-    return runs.parse_args(script.Args, script.recipe, list(map(str, argv)), script.ENV_OPTIONS, script.BUFFERS)[0]
+    return runs.parse_args(script, list(map(str, argv)))[0]
 
 
 def files(folder):
@@ -83,12 +86,23 @@ def shared(text):
     return "".join(lines[next(k for k, line in enumerate(lines) if line.startswith("# Shared")) :])
 
 
-def test_shared_sections_are_the_same_to_the_letter():
-    texts = [path.read_text() for path in SCRIPTS]
-    assert len(texts) >= 2
-    assert len({shared(text) for text in texts}) == 1
-    changed = texts[0].replace("lastgaelam = (delta + ", "lastgaelam = (delta - ")
-    assert changed != texts[0] and shared(changed) != shared(texts[1])  # one character is seen
+# by script, the lines of the shared sections that only it has; they end with "# this problem"
+ITS_OWN = {
+    "ppo_gtrxl_rocket": [
+        "add_rewards(args, progress, training, envs, batch, episodes)",
+        "show_differences(agent, args, env_options)",
+    ]
+}
+
+
+def test_shared_sections_are_the_same_but_for_the_lines_of_a_problem():
+    common = set()
+    for path in SCRIPTS:
+        lines = shared(path.read_text()).splitlines()
+        own = [line for line in lines if line.endswith("  # this problem")]
+        assert [line.removesuffix("  # this problem").strip() for line in own] == ITS_OWN.get(path.stem, [])
+        common.add("\n".join(line for line in lines if line not in own))
+    assert len(SCRIPTS) >= 2 and len(common) == 1
 
 
 # Table 1 of the paper: (double integrator, Van der Pol, rocket)
@@ -116,12 +130,12 @@ def test_the_papers_recipe_is_table_1(k, script):
     """Every row of its column, first and last value, and nothing of ours in the learning."""
     args = parse("--recipe=paper", script=script)
     for name, row in TABLE_1.items():
-        value, expected = getattr(args, name), row[k]
+        value, expected = plain_args(args)[name], row[k]
         if isinstance(expected, tuple):
-            value = script.value_at(value, 0.0), script.value_at(value, 1.0)
+            value = Schedule(value).at(0.0), Schedule(value).at(1.0)
         assert value == expected, name
-    assert {name: getattr(args, name) for name in TURNED_OFF} == TURNED_OFF
-    assert not isinstance(args.log_std, str)  # learned
+    assert {name: plain_args(args)[name] for name in TURNED_OFF} == TURNED_OFF
+    assert not args.log_std.has_points  # learned
 
 
 def test_flags_of_the_interface():
@@ -145,13 +159,16 @@ def test_flags_of_the_interface():
 def test_a_recipe_is_what_no_flag_sets(script, env_id):
     """Of every id, and of the two that win over it: a flag and the paper's column."""
     changes = script.recipe(script.Args(env_id=env_id))
+    ours = vars(script.Args(**changes))
     args, paper = parse("--env-id", env_id, script=script), parse("--env-id", env_id, "--recipe=paper", script=script)
     for name, value in vars(script.Args(env_id=env_id)).items():
         assert name in ("recipe", "eval_starts") or getattr(paper, name) == value, name
-        assert name in ("recipe", "eval_starts") or getattr(args, name) == changes.get(name, value), name
+        assert name in ("recipe", "eval_starts") or getattr(args, name) == (ours[name] if name in changes else value), (
+            name
+        )
     assert "eval_starts" not in changes
     typed = parse("--env-id", env_id, "--log-std", "0:-1", "1:-2", "--target-kl=0.5", script=script)
-    assert (typed.log_std, typed.target_kl) == ("0:-1 1:-2", 0.5)
+    assert (str(typed.log_std), typed.target_kl) == ("0:-1 1:-2", 0.5)
     assert typed.total_updates == changes["total_updates"]
 
 
@@ -214,12 +231,12 @@ def test_a_dispersed_training_begins_with_the_shipped_policy(monkeypatch, capsys
     """Named in its recipe; a line where it is missing, or where a flag asks for another network."""
     monkeypatch.chdir(ROOT)
     args = dispersed()
-    assert args.checkpoint == "results/rocket_cutoff/agent.safetensors" and args.log_std == "0:-3.5 1:-6.5"
+    assert args.checkpoint == "results/rocket_cutoff/agent.safetensors" and str(args.log_std) == "0:-3.5 1:-6.5"
     failing = dispersed("--failure=0.25")
     assert failing.checkpoint == "results/rocket_dispersed/agent.safetensors" and failing.total_updates == 150
     anew = dispersed("--embed-dim=8")
     assert anew.checkpoint is None and anew.num_envs == 64
-    assert anew.log_std == ROCKET.RECIPES["RocketAscentCutoff-v0"]["log_std"]  # not that of a trained policy
+    assert str(anew.log_std) == ROCKET.RECIPES["RocketAscentCutoff-v0"]["log_std"]  # not that of a trained policy
     said = capsys.readouterr().out
     assert re.match("--embed-dim 8: .*results/rocket_cutoff.* has another\n.* begins anew", said)
     assert dispersed("--recipe=paper").checkpoint is None
@@ -331,9 +348,7 @@ def test_smoke_run_logs_the_tags(smoke):
         assert step == updates[-1] and shown == pytest.approx(float(value), rel=1e-6), tag
     rates = [value for _, value in logged["charts/learning_rate"]]
     args = script.Args(**script.recipe(script.Args(env_id=env_id)))
-    expected = [
-        script.value_at(args.learning_rate, end) * np.exp(script.value_at(args.log_std, end)) for end in (0.0, 1.0)
-    ]
+    expected = [args.learning_rate.at(end) * np.exp(args.log_std.at(end)) for end in (0.0, 1.0)]
     assert rates == pytest.approx(expected, rel=1e-6)
 
 
@@ -538,7 +553,7 @@ def test_eval_every_uses_starts_of_its_own(tmp_path, monkeypatch):
     monkeypatch.setattr(PhasedTask, "evaluate", lambda *a, **k: [seeds.append(a[2]), evaluate(*a, **k)][1])
     DI.main([*TINY, "--total-updates=3", "--eval-every=2", "--eval-seed=5"])
     assert len(seeds) == 2 and seeds[1] == 5
-    assert seeds[0] > runs.RANGES["eval_seed"][1]  # no --eval-seed reaches it
+    assert seeds[0] > facts(DI.Args, Range)["eval_seed"].high  # no --eval-seed reaches it
     assert [step for step, _ in scalars(run_folder())["eval/ratio_of_sums"]] == [200, 300]
 
 
@@ -611,7 +626,7 @@ def rocket(tmp_path_factory):
 @pytest.mark.parametrize("env_id", ["RocketAscent-v0", "TwoStageLEO-v0"])
 def test_phases_are_one_hot_whatever_their_number(env_id):
     """The environment shows the phases as 0, 1 / (n - 1) .. 1."""
-    buffers = ROCKET.BUFFERS[env_id]
+    buffers = ROCKET.constants(env_id)
     number = len(ROCKET.ROCKETS[env_id].rocket.burns)
     agent = SimpleNamespace(**{name: torch.tensor(value) for name, value in buffers.items()})
     obs = torch.tensor([[6.4e6, 0.0, 0.0, 0.0, 7e3, 0.0, 1e4, 0.5, phase] for phase in np.linspace(0, 1, number)])
@@ -943,7 +958,8 @@ def flag(name):
 
 
 FIELDS = {field.name: (module, field) for module in reversed(MODULES) for field in dataclasses.fields(module.Args)}
-NUMBERS = [pair for pair in FIELDS.values() if re.search(r"\b(int|float|Schedule)\b", str(pair[1].type))]
+RANGES = {name: bounds for module in MODULES for name, bounds in facts(module.Args, Range).items()}
+NUMBERS = [FIELDS[name] for name in FIELDS if name in RANGES]
 POSITIVE = "total_updates num_envs num_minibatches update_epochs embed_dim num_heads mlp_dim hidden_dim"
 POSITIVE += " eval_starts reward_scale max_grad_norm target_kl flights_per_start"
 
@@ -953,7 +969,7 @@ POSITIVE += " eval_starts reward_scale max_grad_norm target_kl flights_per_start
 def test_every_number_has_a_range(refuses, module, field):
     """NaN, infinities and absurd values in every numeric flag, and zero where nothing can be of size zero."""
     values = ["-9", "1" + "0" * 20] + (["0"] if field.name in POSITIVE.split() else [])
-    if re.search("float|Schedule", str(field.type)):
+    if isinstance(RANGES[field.name].low, float) or isinstance(field.default, Schedule):
         values += ["nan", "inf", "-inf"]
     for value in values:
         message = refuses(f"{flag(field.name)}={value}", script=module)
@@ -962,6 +978,14 @@ def test_every_number_has_a_range(refuses, module, field):
         number = float(re.search(r" (\S+): ", message).group(1))
         assert number == float(value) or np.isnan(number) and value == "nan"
         assert np.isfinite([float(low), float(high)]).all() and not float(low) <= number <= float(high)
+
+
+def test_numbers_are_all_there():
+    """Every flag of numbers has a range."""
+    for module in MODULES:
+        hints = get_type_hints(module.Args)
+        numeric = {name for name, hint in hints.items() if {int, float, Schedule} & {hint, *get_args(hint)}}
+        assert numeric == facts(module.Args, Range).keys()
 
 
 @pytest.mark.parametrize("name", ["gamma", "gae_lambda", "clip_coef", "learning_rate"])
@@ -991,8 +1015,8 @@ FLOWN = ["--eval-only", "--checkpoint", ROOT / "results" / "di" / "agent.safeten
         (["--num-envs", 80, "--flights-per-start", 3], "--flights-per-start 3: must divide --num-envs 80"),
         (["--num-envs", 4, "--flights-per-start=8"], "--flights-per-start 8: must divide --num-envs 4"),
         (["--num-envs", 8, "--flights-per-start", "0:1", "1:4"], "must divide --num-envs 8; it is 3 in one update"),
-        (["--log-std", "0:-1", "0.4:-2:-7"], "--log-std 0:-1 0.4:-2:-7: must be a number, or points as"),
-        (["--log-std", "0:-1:-2", "0.4:-2:-7"], "--log-std 0:-1:-2 0.4:-2:-7: must be a number, or points as"),
+        (["--log-std", "0:-1", "0.4:-2:-7"], "--log-std: 0:-1 0.4:-2:-7: must be a number, or points as"),
+        (["--log-std", "0:-1:-2", "0.4:-2:-7"], "--log-std: 0:-1:-2 0.4:-2:-7: must be a number, or points as"),
         (["--eval-only"], "--checkpoint"),
         (["--eval-json", "a.json"], "--eval-json a.json: only with --eval-only"),
         (["--eval-npz", "a.npz"], "--eval-npz a.npz: only with --eval-only"),
@@ -1029,31 +1053,22 @@ def test_tracking_without_a_login_is_one_line_before_any_solve(refuses, monkeypa
     assert not list(Path("runs").glob("*"))
 
 
-@pytest.mark.parametrize(
-    "scale, line",
-    [
-        ([1.0] * 5, "holds 5; must hold 6 numbers, one for each of its observations"),
-        ([1.0] * 7, "holds 7; must hold 6 numbers"),
-        ([1.0], "holds 1; must hold 6 numbers"),
-        ([1.0] * 5 + [0.0], r"is \[1.0, .*, 0.0\]; must be finite, without 0"),
-        ([1.0] * 5 + [np.nan], r"is \[1.0, .*, nan\]; must be finite, without 0"),
-    ],
-)
-def test_scale_that_does_not_fit_the_observations(scale, line):
-    """A slip in a script's BUFFERS, before anything is learned or written."""
-    env_id = "VanDerPolWaypoints-v0"
-    buffers = {**VDP.BUFFERS, env_id: {"observation_scale": scale}}
-    with pytest.raises(SystemExit) as stop:
-        runs.parse_args(VDP.Args, VDP.recipe, ["--env-id", env_id], VDP.ENV_OPTIONS, buffers)
-    name = r"error: BUFFERS of ppo_gtrxl_vdp.py: observation_scale of VanDerPolWaypoints-v0 "
-    assert re.match(name + line, stop.value.code) and "\n" not in stop.value.code
+@pytest.mark.parametrize("scale", [[1.0] * 5, [1.0] * 7, [1.0] * 5 + [0.0], [1.0] * 5 + [np.nan]])
+def test_scale_that_does_not_fit_the_observations(monkeypatch, scale):
+    """A slip in an environment, before anything is learned or written."""
+    batch = runs.make_batch("VanDerPolWaypoints-v0", 1)
+    batch.observation_scale = np.array(scale)
+    monkeypatch.setattr(runs, "make_batch", lambda env_id, num_envs: batch)
+    line = r"observation_scale of VanDerPolWaypoints-v0 is \[1.0, .*\]; it must hold 6 finite numbers other than 0"
+    with pytest.raises(BadInput, match=line):
+        VDP.constants("VanDerPolWaypoints-v0")
 
 
-def test_id_that_no_environment_has():
+def test_id_that_no_environment_has(monkeypatch):
     """A script's id whose line in PROBLEMS is missing."""
-    buffers = {**DI.BUFFERS, "Forgotten-v0": {"observation_scale": [1.0] * 3}}
-    with pytest.raises(SystemExit, match="error: --env-id Forgotten-v0: .* envs.PROBLEMS must have it"):
-        runs.parse_args(DI.Args, DI.recipe, ["--env-id=Forgotten-v0"], DI.ENV_OPTIONS, buffers)
+    monkeypatch.setattr(DI, "ENV_IDS", (*DI.ENV_IDS, "Forgotten-v0"))
+    with pytest.raises(BadInput, match="env_id is 'Forgotten-v0', of no family"):
+        parse("--env-id=Forgotten-v0")
 
 
 def test_minibatches_left_alone_are_lowered(capsys):
@@ -1066,14 +1081,14 @@ def test_minibatches_left_alone_are_lowered(capsys):
 @pytest.mark.parametrize("num_envs, flights", [(32, 32), (64, 32), (4, 4), (1, 1)])
 def test_flights_per_start_left_alone_are_lowered(capsys, num_envs, flights):
     """The rocket's 32."""
-    assert parse("--num-envs", num_envs, "--num-minibatches=1", script=ROCKET).flights_per_start == flights
+    assert parse("--num-envs", num_envs, "--num-minibatches=1", script=ROCKET).flights_per_start == Schedule(flights)
     line = capsys.readouterr().out
     assert line.startswith(f"--flights-per-start lowered from 32 to {flights}") if flights < 32 else line == ""
 
 
 @pytest.mark.parametrize("num_envs", [48, 33, 6007])
 def test_flights_per_start_left_alone_divide_the_environments(num_envs):
-    assert num_envs % parse("--num-envs", num_envs, script=ROCKET).flights_per_start == 0
+    assert num_envs % parse("--num-envs", num_envs, script=ROCKET).flights_per_start.at(0.0) == 0
 
 
 def test_unwritable_run_folder(refuses):
@@ -1177,7 +1192,7 @@ def test_checkpoint_of_other_buffers_and_sizes(refuses, trained, tmp_path):
     ]:
         path = edited_checkpoint(trained, tmp_path / "agent", tensors)
         message = refuses("--eval-only", "--checkpoint", path)
-        assert re.search(f"--checkpoint {path}: does not fit its own args, BUFFERS or features .{shapes}", message)
+        assert re.search(f"--checkpoint {path}: does not fit its own args, constants or features .{shapes}", message)
 
 
 @pytest.mark.parametrize(
