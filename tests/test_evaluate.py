@@ -515,7 +515,10 @@ def full_disk(*_):
 
 def spoil(run, fault):
     """Damage a run folder in one way."""
-    if fault == "no events":
+    if fault == "unfinished":
+        (run / "eval.json").unlink()
+        (run / "training_state.pt").touch()
+    elif fault == "no events":
         for path in run.glob("events*"):
             path.unlink()
     elif fault in ("agent.safetensors", "eval.json", "eval.npz"):
@@ -543,7 +546,8 @@ def spoil(run, fault):
 
 FAULTS = {
     "agent.safetensors": "agent.safetensors",
-    "eval.json": "eval.json",
+    "eval.json": "eval.json is not there",
+    "unfinished": "eval.json is not there; the training has not ended: go on with --resume",
     "eval.npz": "eval.npz",
     "no events": "no TensorBoard scalars",
     "truncated npz": "not a readable .npz",

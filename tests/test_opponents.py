@@ -372,7 +372,7 @@ def test_report(compared):
 @pytest.mark.parametrize(
     "argv, line",
     [
-        (["{missing}"], "No such file"),
+        (["{missing}"], "eval.json is not there"),
         (["{fixed}"], "the env_id of .* is RocketAscent-v0; it must be a rocket's with cut-off"),
         (["{good}", "--starts=9"], "'9' must be a whole number from 10 to 100000"),
         (["{good}", "--starts=20", "--solved=21"], "--solved is 21; it must be at most 20, as --starts is"),

@@ -315,7 +315,7 @@ def test_a_bad_file_of_vehicles_is_left_out_with_a_line(tmp_path):
     assert second.startswith("vehicles/b_foreign.py is left out: env_id is 'VanDerPol-v0'")
     assert third == "vehicles/c_broken.py is left out: NameError: name 'heavy' is not defined"
     assert fourth == "vehicles/d_ends.py is left out: SystemExit: 2"
-    allowed = "env_id is 'TwoStageLEO-v0', another rocket's; it must be new"
+    allowed = "env_id is 'TwoStageLEO-v0', which vehicles/z_good.py has already; it must be new"
     assert copy == f"vehicles/zz_copy.py is left out: {allowed}"
 
 
