@@ -167,21 +167,25 @@ for _problem in BUILT_IN:
 
 
 OF_ANOTHER = ".* was another rocket's id"  # the warning of `register_rocket`
+FILE_OF_ROCKET: dict[str, str] = {}  # the file that registered it, by environment id
 
 
 def import_files_of(folder: str):
     """Run every file of a folder of tables. A file that fails is left out, with a line that says why."""
     for path in sorted(Path(__file__).parent.glob(f"{folder}/*.py")):
+        known = set(ROCKETS)
         try:
             with warnings.catch_warnings():
                 warnings.filterwarnings("error", message=OF_ANOTHER)
                 import_module(f"{folder}.{path.stem}")
+            FILE_OF_ROCKET.update(dict.fromkeys(ROCKETS.keys() - known, f"{folder}/{path.name}"))
         except BadInput as error:
             print(f"{folder}/{path.name} is left out: {error}", file=sys.stderr)
         except UserWarning as error:
             env_id = str(error).split()[0]
+            other = FILE_OF_ROCKET.get(env_id, "envs.py")
             print(
-                f"{folder}/{path.name} is left out: env_id is {env_id!r}, another rocket's; it must be new",
+                f"{folder}/{path.name} is left out: env_id is {env_id!r}, which {other} has already; it must be new",
                 file=sys.stderr,
             )
         except (Exception, SystemExit) as error:  # a bad file must not stop the other files

@@ -47,6 +47,10 @@ def read_metrics(path: Path) -> dict:
 
 def read_json(path: Path) -> dict:
     """The eval.json of a finished run. Raises ValueError that names the file and what is wrong with it."""
+    if not path.exists():
+        begun = (path.parent / "training_state.pt").exists()
+        why = f"; the training has not ended: go on with --resume {path.parent}" if begun else ""
+        raise ValueError(f"{path} is not there{why}")
     try:
         metrics = json.loads(path.read_text())
     except ValueError as error:

@@ -20,7 +20,7 @@ import envs
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-LONGEST = ["test_scripts", "test_robustness", "test_run_seeds", "test_processes", "test_fuzzing", "test_onnx"]
+LONGEST = ["test_processes", "test_scripts", "test_robustness", "test_docs", "test_rocket_baselines", "test_opponents"]
 
 
 def pytest_collection_modifyitems(items):

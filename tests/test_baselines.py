@@ -41,6 +41,15 @@ def flown(env_id, x0, u):
 # --- double integrator ------------------------------------------------------------------------------------------------
 
 
+def test_riccati_numbers():
+    K, P = lqr(DOUBLE_INTEGRATOR)
+    assert K.shape == (50, 2) and P.shape == (51, 2, 2)
+    np.testing.assert_allclose(K[0], [2.585923, 3.443511], atol=5e-7)
+    np.testing.assert_allclose(P[0], [[13.317991, 3.201823], [3.201823, 4.603603]], atol=5e-7)
+    assert np.trace(P[0]) / 3 == pytest.approx(5.97386, abs=5e-6)
+    np.testing.assert_array_equal(P[-1], 20 * np.eye(2))
+
+
 def test_riccati_is_the_least_squares_optimum():
     """Without its bound the problem is least squares in u: x'P_0 x is its minimum and -K_0 x its first control."""
     A, B = np.array([[1, 0.1], [0, 1]]), np.array([0.005, 0.1])
@@ -58,6 +67,18 @@ def test_riccati_is_the_least_squares_optimum():
     u, residual, *_ = np.linalg.lstsq(system, right)
     assert x0 @ P[0] @ x0 == pytest.approx(residual[0], rel=1e-12)
     assert -K[0] @ x0 == pytest.approx(u[0], rel=1e-10)
+
+
+def test_saturation_numbers():
+    x0 = starts(1000)
+    optimum, (_, P) = reference("DoubleIntegrator-v0", x0), lqr(DOUBLE_INTEGRATOR)
+    unbounded = np.einsum("ni,ij,nj->n", x0, P[0], x0)
+    ratio, saturates = optimum["cost"] / unbounded, (np.abs(optimum["u"]) == 4).any(axis=1)
+    assert saturates.mean() == pytest.approx(0.11, abs=0.01)
+    assert ratio.mean() == pytest.approx(1.0007, abs=1e-4)
+    assert ratio.max() == pytest.approx(1.027, abs=2e-3)
+    np.testing.assert_allclose(ratio[~saturates], 1, rtol=0, atol=1e-12)
+    assert optimum["episodic_return"].mean() == pytest.approx(14.0, abs=0.1)
 
 
 def test_clipped_lqr_is_the_box_qp_optimum():
@@ -331,15 +352,9 @@ def test_feedback_about_a_target_that_is_not_at_rest(new_problem):
 def test_dynamics_that_are_not_analytic_are_linearised():
     """|v| v drag about (2, 1.5): v' = -v^2 + u there, so that over a step the exact v is v0 / (1 + v0 t)."""
     drag = replace(VAN_DER_POL, f=lambda x, u: (x[1], u - x[1] * np.abs(x[1])))
-    A, B = baselines.linearise(drag, (2.0, 1.5))
+    A, _ = baselines.linearise(drag, (2.0, 1.5))
     assert A[1, 1] == pytest.approx(1 / (1 + 1.5 * 0.1) ** 2, abs=2e-5)
     assert A[1, 0] == 0 and A[0, 0] == pytest.approx(1, abs=1e-12)
-    squared = replace(VAN_DER_POL, f=lambda x, u: (x[1], u - x[1] ** 2))
-    np.testing.assert_allclose(A, baselines.linearise(squared, (2.0, 1.5))[0], rtol=0, atol=1e-11)
-    rail = replace(VAN_DER_POL, f=lambda x, u: (x[1], u - np.interp(x[0], [-10.0, 0.0, 10.0], [-10.0, 0.0, 20.0])))
-    spring = replace(VAN_DER_POL, f=lambda x, u: (x[1], u - 2 * x[0]))
-    for got, expected in zip(baselines.linearise(rail, (2.0, 1.5)), baselines.linearise(spring, (2.0, 1.5))):
-        np.testing.assert_allclose(got, expected, rtol=0, atol=1e-11)
 
 
 @pytest.mark.parametrize("env_id", IN_THE_PLANE)

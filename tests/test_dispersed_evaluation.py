@@ -12,7 +12,7 @@ import envs
 import evaluate
 import runs
 from common.tasks import task_of
-from rocket.metrics import box_rate, dispersed_metrics, draws, evaluate_dispersed
+from rocket.metrics import box_rate, dispersed_metrics, draws
 
 CUTOFF, LEO = "RocketAscentCutoff-v0", "TwoStageLEO-v0"
 FLIGHTS = 12
@@ -96,14 +96,6 @@ def test_one_flight_is_the_environments_own(flown):
     np.testing.assert_array_equal(arrays["final_y"][3, :6], obs[:6])
     assert arrays["final_y"][3, 6] == info["final_mass_kg"] and arrays["final_t"][3] == info["final_time_s"]
     np.testing.assert_array_equal(arrays["final_error"][3], info["error"])
-
-
-def test_batches_change_nothing(flown):
-    metrics, arrays = flown
-    env_id = metrics["env_id"]
-    again, ends = evaluate_dispersed(env_id, optimum_replayed(env_id), 7, FLIGHTS, 1, at_once=5)
-    assert all(np.array_equal(ends[key], arrays[key]) for key in ends)
-    assert all(metrics[key] == value for key, value in again.items())
 
 
 @pytest.mark.parametrize("inside, n", [(0, 20), (20, 20), (13, 20), (1705, 1705)])

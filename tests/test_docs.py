@@ -1,21 +1,32 @@
-"""The pages: their links, tables and commands, and the front page's numbers against the results."""
+"""The pages: links, commands, the front page's numbers; their code, the notebook and the site as a reader has them."""
 
+import copy
 import importlib
 import json
+import os
 import re
 import shlex
 import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import baselines
 import envs
+import evaluate
+import ppo_gtrxl_di
 import runs
+from common import curves
 from phased.problem import flights_of_seed
+from rocket import guidance
 
 ROOT = Path(__file__).resolve().parents[1]
+sys.path.append(str(ROOT / "docs"))
+import walkthrough  # noqa: E402
+
 OWN_PROBLEM = ROOT / "docs" / "own-problem.md"
 PAGES = [ROOT / f"{name}.md" for name in ("README", "CHANGELOG", "CONTRIBUTING", "problems/README", "pages/README")]
 PAGES += sorted((ROOT / "docs").rglob("*.md"))
@@ -192,3 +203,122 @@ def test_the_page_s_problem_is_that_of_the_folder(new_problem, monkeypatch):
     printed, shipped = (envs.fly(env_id, lambda obs, t: thrust[t], x0) for env_id in (made[0], "Goddard-v0"))
     for key, value in printed.items():
         np.testing.assert_array_equal(value, shipped[key])
+
+
+# --- a run as a reader makes it: the ten steps, the notebook, the site, the log ---------------------------------------
+
+NUMBER = re.compile(r"-?\d+(?:\.\d*)?")
+
+
+def same(said, printed):
+    """Whether two lines say the same, their blanks aside; whole numbers below 100, which count, are exact."""
+    words = [NUMBER.sub("#", line).split() for line in (said, printed)]
+    numbers = [NUMBER.findall(line) for line in (said, printed)]
+    return words[0] == words[1] and all(close(*pair) for pair in zip(*numbers))
+
+
+def close(said, printed):
+    """Whether two numbers, as text, are one unit of the last digit apart at most."""
+    decimals = len(said.partition(".")[2])
+    unit = 10.0**-decimals if decimals or abs(int(float(said))) >= 100 else 0.0
+    return abs(float(said) - float(printed)) <= 1.001 * unit
+
+
+RUN = """
+import json, walkthrough
+print(json.dumps(walkthrough.run([code for code, _ in walkthrough.steps(walkthrough.PAGE.read_text())])[0]))
+"""
+
+
+@pytest.mark.slow
+def test_the_ten_steps_print_what_the_page_says():
+    """All in one new process, as a reader runs them, to one unit of the last digit that is shown."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT / "docs")}
+    command = [sys.executable, "-c", RUN]
+    done = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, done.stderr
+    steps = walkthrough.steps(walkthrough.PAGE.read_text())
+    for (_, said), printed in zip(steps, json.loads(done.stdout), strict=True):
+        lines, found = said.splitlines(), printed.splitlines()
+        assert len(lines) == len(found) and all(map(same, lines, found)), (said, printed)
+
+
+def printed(notebook):
+    """What all cells of a notebook print."""
+    outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
+    return "".join(output["text"] for output in outputs if output.output_type == "stream" and output.name == "stdout")
+
+
+@pytest.mark.slow
+def test_the_notebook_prints_what_it_shows():
+    """But for the numbers. The shipped policy misses by little, the brief training ends near LQR."""
+    nbformat = pytest.importorskip("nbformat", reason="a notebook needs nbclient (requirements-extras.txt)")
+    nbclient = pytest.importorskip("nbclient", reason="a notebook needs nbclient (requirements-extras.txt)")
+    pytest.importorskip("ipykernel", reason="a notebook needs ipykernel (requirements-extras.txt)")
+    shown = nbformat.read(ROOT / "docs" / "first_flight.ipynb", as_version=4)
+    where = {"metadata": {"path": str(ROOT / "docs")}}
+    executed = nbclient.NotebookClient(copy.deepcopy(shown), timeout=600, resources=where).execute()
+    said, text = printed(shown), printed(executed)
+    assert NUMBER.sub("#", text).split() == NUMBER.sub("#", said).split()
+    misses = [float(number) for number in re.findall(r"\|\|error\|\| (\S+),", text)]
+    assert len(misses) == 2 and max(misses) < 1e-4
+    ratios = [float(number) for number in re.findall(r"ratio (\S+)", text)]
+    assert len(ratios) == 4 and 1 <= ratios[-1] < 1.3 and ratios[-1] < ratios[0]
+
+
+@pytest.mark.slow
+def test_the_site_builds_and_holds_every_page(tmp_path):
+    """A link that leads nowhere would end the build."""
+    pytest.importorskip("material", reason="the site needs mkdocs-material (requirements-extras.txt)")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "-f", str(ROOT / "docs" / "mkdocs.yml")]
+    done = subprocess.run([*command, "-d", str(tmp_path)], capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, done.stdout + done.stderr
+    for page in [*(ROOT / "docs").rglob("*.md"), ROOT / "CONTRIBUTING.md"]:
+        assert (tmp_path / page.relative_to(ROOT)).with_suffix(".html").exists(), page
+    front = (tmp_path / "index.html").read_text()
+    assert "results/rocket_cutoff/figures/animation.gif" in front and (tmp_path / "results/di/index.html").exists()
+    styles = re.findall(r'<link rel="stylesheet" href="([^"]+)"', front)
+    assert styles and all((tmp_path / style).exists() for style in styles)
+    assert not [path for path in tmp_path.rglob("*") if path.suffix in {".npz", ".safetensors", ".csv", ".pt"}]
+    # links to folders are left as they are: there has to be a page to be shown
+    for name in re.findall(r"unrecognized relative link '[./]*(\w+)'", done.stdout + done.stderr):
+        assert (tmp_path / name / "index.html").exists(), name
+
+
+# --- the log's tags ---------------------------------------------------------------------------------------------------
+
+# the optimum's mass and time are named without "final"; its mass for another orbit is explained beside its ratio
+LEFT_TO_THE_OPTIMUM = {"eval/mass_kg", "eval/mass_reached_kg"}
+
+
+def documented(tag, patterns):
+    """Whether a written tag is an instance of one of the page's; one of the optimum has to be one of ours, too."""
+    found = [name for name, pattern in patterns.items() if pattern.fullmatch(tag)]
+    if found == ["eval/reference_<key>"]:
+        ours = tag.replace("reference_", "")
+        return ours in LEFT_TO_THE_OPTIMUM or documented(ours, patterns)
+    return bool(found)
+
+
+@pytest.mark.slow
+def test_every_tag_of_a_run_is_on_its_page(tmp_path, monkeypatch):
+    """Of a smoke run, of the shipped curves, of a landing, and of flights with failures."""
+    monkeypatch.chdir(tmp_path)
+    flags = "--embed-dim=8 --num-envs=2 --num-minibatches=2 --eval-starts=10 --total-updates=2 --eval-every=1"
+    ppo_gtrxl_di.main(flags.split())
+    (run,) = Path("runs").iterdir()
+    tags = set(EventAccumulator(str(run)).Reload().Tags()["scalars"])
+    for path in (ROOT / "results").rglob("seeds/*.csv"):
+        tags |= set(curves.read_csv(path))
+    no_thrust = lambda obs, t: np.zeros((len(obs), 3))  # noqa: E731
+    cutoff = "RocketAscentCutoff-v0"  # of eval seed 0 and these options the optima are stored
+    for metrics, _ in (
+        evaluate.evaluate("MarsLanding-v0", no_thrust, 0, 2),
+        evaluate.evaluate(cutoff, guidance.open_loop(cutoff), 0, 100, dispersion=1.0, failure=0.3),
+    ):
+        tags |= {f"eval/{key}" for key, value in metrics.items() if isinstance(value, int | float)}
+    page = (ROOT / "docs" / "read-the-log.md").read_text()
+    named = re.findall(r"`((?:charts|losses|eval)/[^`]+)`", page)
+    patterns = {tag: re.compile(r"\w+".join(map(re.escape, re.split(r"<\w+>", tag)))) for tag in named}
+    assert "eval/failure_saved_rate" in tags
+    assert [tag for tag in sorted(tags) if not documented(tag, patterns)] == []

@@ -1,6 +1,5 @@
 """evaluate.py against plain loops: ratios, the interface's keys, figures, results folders, bad input."""
 
-import csv
 import errno
 import hashlib
 import json
@@ -16,10 +15,10 @@ import baselines
 import envs
 import evaluate
 from common import files
-from common.curves import cell, evaluated, read_csv, read_curve, write_csv
+from common.curves import evaluated, read_csv, read_curve, write_csv
 from common.files import write_json, write_npz
 from drawing import animation
-from phased.metrics import cost_parts, hits_every_circle, near_origin_metrics, ratio_metrics
+from phased.metrics import cost_parts, near_origin_metrics, ratio_metrics
 
 IN_THE_PLANE = [env_id for env_id, problem in envs.PROBLEMS.items() if problem.weighted and problem.states == 2]
 SINGLE, WAYPOINTS = "DoubleIntegrator-v0", "DoubleIntegratorWaypoints-v0"
@@ -163,14 +162,6 @@ def test_metrics_of_a_single_phase_equal_plain_loops():
     assert cost_parts(envs.PROBLEMS[SINGLE], arrays["x"], arrays["u"]) == pytest.approx(np.c_[state, control, terminal])
 
 
-@pytest.mark.parametrize("env_id", IN_THE_PLANE)
-def test_cost_parts_equal_the_environments(env_id):
-    flight = envs.fly(env_id, feedback(env_id, 5.0, effort=2.0), baselines.starts(1, 6))
-    parts = np.c_[flight["cost_state"], flight["cost_control"], flight["cost_terminal"]]
-    assert cost_parts(envs.PROBLEMS[env_id], flight["x"], flight["u"]) == pytest.approx(parts, rel=1e-12)
-    assert np.array_equal(hits_every_circle(envs.PROBLEMS[env_id], flight["x"]), flight["hit"].all(axis=1))
-
-
 def test_ten_start_statistic_is_the_papers():
     rng = np.random.default_rng(0)
     cost, optimum = rng.uniform(2, 3, (2, 40))
@@ -261,12 +252,11 @@ def test_arrays_hold_the_flight_and_not_the_next_episode():
     shapes = {"t": (T + 1,), "x": (n, T + 1, 2), "u": (n, T), "reward": (n, T), "cost": (n,)}
     shapes |= {"x_reference": (n, T + 1, 2), "u_reference": (n, T), "cost_reference": (n,)}
     assert {key: value.shape for key, value in arrays.items()} == shapes
-    assert arrays["t"] == pytest.approx(np.linspace(0, 5, T + 1))
     x, u = arrays["x"], arrays["u"]
     assert np.array_equal(x[:, 0], np.random.default_rng(4).uniform(-1, 1, (n, 2)))
     assert np.abs(u).max() == 4.0 < np.abs(30 * x[:, 0, 0] + 9 * x[:, 0, 1]).max()
-    for x0, x1, v in zip(x[:, -2], x[:, -1], u[:, -1]):  # the exact discretisation leads to the last state
-        assert x1 == pytest.approx([x0[0] + 0.1 * x0[1] + 0.005 * v, x0[1] + 0.1 * v], abs=1e-12)
+    last = np.column_stack([x[:, -2, 0] + 0.1 * x[:, -2, 1] + 0.005 * u[:, -1], x[:, -2, 1] + 0.1 * u[:, -1]])
+    np.testing.assert_allclose(x[:, -1], last, atol=1e-12)  # by the exact discretisation
 
 
 def test_reference_of_other_starts_is_refused():
@@ -307,16 +297,8 @@ def test_table_shows_optimum_ours_and_ratio():
         optimum, ours = metrics[f"reference_{part}_mean"], metrics[f"{part}_mean"]
         assert line.split()[-3:] == [f"{optimum:.4f}", f"{ours:.4f}", f"{ours / optimum:.4f}"]
     text = "\n".join(lines)
-    for key in RATIOS | TEN_STARTS:
+    for key in RATIOS | TEN_STARTS | NEAR:
         assert f"{metrics[key]:.4f}" in text, key
-    assert "eval seed 5" in text
-    (first,) = (k for k, line in enumerate(lines) if "Cost ratio" in line)
-    assert lines[first + 1].split()[:2] == ["mean", f"{metrics['ratio_mean']:.4f}:"]
-    low, high = (metrics[f"ten_start_ratio_mean_p{p}"] for p in ("05", "95"))
-    assert low < high and f"{low:.4f} to {high:.4f}" in lines[first + 2]
-    assert "near the origin" in lines[first + 3]
-    (line,) = (line for line in lines if f"p95 {metrics['ratio_p95']:.4f}" in line)
-    assert line.endswith(f"of the origin {metrics['loss_near_origin_mean']:.4f}")
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), np.float64("nan")])
@@ -363,14 +345,9 @@ def test_curve_of_a_resumed_run_keeps_the_last_value(tmp_path):
     assert values == pytest.approx([100 / 3, 200 / 3, 100.5, 400 / 3 + 0.5], rel=1e-6)
     path = tmp_path / "1.csv"
     write_csv(path, curve)
-    with open(path, newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert [row["global_step"] for row in rows] == ["100", "200", "300", "400"]
-    assert [row["eval/ratio_mean"] for row in rows] == ["", "", "1", "1.5"]
-    assert path.read_text().startswith("global_step,")
+    head, *rows = path.read_text().splitlines()
+    assert head == "global_step,losses/policy_loss,eval/ratio_mean" and rows[2] == "300,100.5,1"
     again = read_csv(path)
-    assert again.keys() == curve.keys()
-    assert [cell(value) for value in (np.nan, np.inf, 3.0)] == ["nan", "inf", "3"]
     for tag, (steps, values) in curve.items():
         assert np.array_equal(again[tag][0], steps)
         assert again[tag][1] == pytest.approx(values, rel=5e-6)
@@ -391,16 +368,27 @@ def test_curve_of_a_resumed_run_keeps_the_last_value(tmp_path):
 def test_figures_show_policy_optimum_targets_and_bounds():
     reference = reference_flight(WAYPOINTS, 3, 12)
     metrics, arrays = evaluate.evaluate(WAYPOINTS, feedback(WAYPOINTS, 1e3, effort=2.0), 3, 12, reference)
-    figure = figure_of("trajectories.png", arrays, metrics)
-    plane, position, velocity, control = figure.axes
+    plane, position, velocity, control = figure_of("trajectories.png", arrays, metrics).axes
     assert [(patch.center, patch.radius) for patch in plane.patches] == [((0.0, 0.0), 0.02), ((0.5, 0.5), 0.02)]
-    red = [line.get_ydata() for line in position.lines if line.get_color() == "tab:red"]
-    blue = [line.get_ydata() for line in position.lines if line.get_color() == "tab:blue"]
-    assert np.array_equal(red, arrays["x"][:10, :, 0]) and np.array_equal(blue, arrays["x_reference"][:10, :, 0])
+    for colour, suffix in (("tab:red", ""), ("tab:blue", "_reference")):
+        drawn = [line.get_ydata() for line in position.lines if line.get_color() == colour]
+        assert np.array_equal(drawn, arrays[f"x{suffix}"][:10, :, 0])
     assert any(np.array_equal(line.get_xdata(), [5.0, 5.0]) for line in control.lines), "the end of phase 1"
     assert {line.get_ydata()[0] for line in control.lines if line.get_linestyle() == "--"} == {-3.0, 3.0}
-    assert all(ax.get_xlabel() and ax.get_ylabel() for ax in figure.axes)
-    assert f"{metrics['ratio_of_sums']:.4f}" in figure.get_suptitle() and WAYPOINTS in figure.get_suptitle()
+
+
+def test_costs_figure_shows_the_parts_and_marks_misses():
+    policy = lets_go(feedback(WAYPOINTS, 1e3, effort=1.3), np.arange(12) == 2, 90)
+    reference = reference_flight(WAYPOINTS, 3, 12, misses=np.arange(12) == 4)
+    metrics, arrays = evaluate.evaluate(WAYPOINTS, policy, 3, 12, reference)
+    panels = {ax.get_ylabel(): ax for ax in figure_of("costs.png", arrays, metrics).axes}
+    flown = envs.fly(WAYPOINTS, policy, baselines.starts(3, 12))
+    for name in ("state", "control", "terminal"):
+        heights = [bar.get_height() for bar in panels[f"{name} cost"].patches]
+        assert heights == pytest.approx([*flown[f"cost_{name}"][:10], *reference[f"cost_{name}"][:10]])
+    labels = [text.get_text() for text in panels["total cost J"].texts]
+    expected = [f"{a / b:.3f}" for a, b in zip(arrays["cost"][:10], arrays["cost_reference"][:10])]
+    assert labels == [*expected[:2], "miss", expected[3], "miss", *expected[5:]]
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -426,10 +414,6 @@ def test_publish_ships_the_first_seed_and_adds_the_second(tmp_path, monkeypatch,
     steps, returns = read_csv(results / "seeds" / "1.csv")["charts/episodic_return"]
     assert steps.tolist() == [4000 * update for update in range(1, 31)]
     assert returns == pytest.approx([14 - 30 * 0.8**update for update in range(1, 31)], rel=5e-6)
-    for name, content in files.items():
-        if name.suffix == ".png":
-            assert content.startswith(b"\x89PNG") and content.rstrip().endswith(b"IEND\xaeB`\x82")
-            assert len(content) > 20_000, "an empty picture is smaller"
 
     command_line(monkeypatch, capsys, "publish", second, results)
     after = snapshot(results)
@@ -440,7 +424,6 @@ def test_publish_ships_the_first_seed_and_adds_the_second(tmp_path, monkeypatch,
     one, two, median, lowest, highest = map(float, row.split()[3:])
     assert (lowest, highest) == (min(one, two), max(one, two)) and median == pytest.approx((one + two) / 2, abs=1e-4)
     assert snapshot(results)[Path("figures/training.png")] != files[Path("figures/training.png")]
-    assert (results / "agent.safetensors").read_bytes() == b"weights of seed 1"
 
 
 def test_a_results_folder_keeps_the_first_thirty_starts(tmp_path, monkeypatch):
@@ -532,7 +515,10 @@ def full_disk(*_):
 
 def spoil(run, fault):
     """Damage a run folder in one way."""
-    if fault == "no events":
+    if fault == "unfinished":
+        (run / "eval.json").unlink()
+        (run / "training_state.pt").touch()
+    elif fault == "no events":
         for path in run.glob("events*"):
             path.unlink()
     elif fault in ("agent.safetensors", "eval.json", "eval.npz"):
@@ -560,7 +546,8 @@ def spoil(run, fault):
 
 FAULTS = {
     "agent.safetensors": "agent.safetensors",
-    "eval.json": "eval.json",
+    "eval.json": "eval.json is not there",
+    "unfinished": "eval.json is not there; the training has not ended: go on with --resume",
     "eval.npz": "eval.npz",
     "no events": "no TensorBoard scalars",
     "truncated npz": "not a readable .npz",

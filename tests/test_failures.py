@@ -107,15 +107,13 @@ def test_a_failing_flight_agrees_with_scipy(group, moment, share):
 
 
 def test_a_stage_that_loses_a_fifth_at_its_ignition_burns_for_five_quarters():
-    draw = np.zeros((1, SCORES + 4))
-    draw[0, -1] = 0.2 / LARGEST  # which of the burns and when does not matter
-    vehicles = envs.draw_vehicles(ROCKET, 0.0, draw, LARGEST, "ignition")
+    draw = np.zeros(SCORES + 4)
+    draw[-1] = 0.2 / LARGEST  # which of the burns and when does not matter
+    vehicles = envs.draw_vehicles(ROCKET, 0.0, draw[None], LARGEST, "ignition")
     np.testing.assert_allclose(vehicles.failure[:, 0], [3, 261.0, 0.2])
     assert vehicles.burn_out[0] == pytest.approx(261 + 700 * 5 / 4, rel=1e-14)
-    lit = vehicles.thrust[:, 0] == pytest.approx(0.8 * 110094)
-    assert np.diff(vehicles.end[:, 0])[:-1] == pytest.approx([75.2, 110.6, 0.0, 875.0]) and not lit
     assert vehicles.thrust[4, 0] == pytest.approx(0.8 * 110094, rel=1e-14)
-    leo = envs.draw_vehicles(ROCKETS[LEO].rocket, 0.0, np.append(np.zeros(12), draw[0, -4:])[None], LARGEST, "ignition")
+    leo = envs.draw_vehicles(ROCKETS[LEO].rocket, 0.0, np.append(np.zeros(12), draw[-4:])[None], LARGEST, "ignition")
     np.testing.assert_allclose(leo.failure[:, 0], [1, 162.0, 0.2])
     assert leo.burn_out[0] == pytest.approx(162 + 393 * 5 / 4, rel=1e-14)
 
@@ -206,9 +204,6 @@ def test_a_draw_of_the_old_width_is_healthy():
     for one, other in zip(episodes(short, 150, {"draw": z}), episodes(long, 150, {"draw": padded})):
         np.testing.assert_array_equal(one, other)
     assert short.vehicles.failure.T.tolist() == [[-1, 0, 0]] * 2
-    alone = gym.make(CUTOFF, failure=0.1)
-    for draw in (np.zeros(SCORES), np.zeros(SCORES + 4)):
-        alone.reset(options={"draw": draw})
 
 
 def test_nothing_announces_a_failure():

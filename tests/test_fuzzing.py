@@ -1,6 +1,6 @@
 """Damaged files, absurd flags and actions: each works or gives one line.
 
-`benchmarks.robustness` tries ten times as many.
+`benchmarks.robustness` tries many more.
 """
 
 import importlib
@@ -17,20 +17,20 @@ import runs
 pytestmark = pytest.mark.slow
 
 
-def test_thousand_command_lines(robustness):
-    ended = robustness.fuzz_arguments(1000)
-    assert sum(ended.values()) == 1000 and min(ended["works"], ended["refused"]) > 10, ended
+def test_hundreds_of_command_lines(robustness):
+    ended = robustness.fuzz_arguments(300)
+    assert sum(ended.values()) == 300 and min(ended["works"], ended["refused"]) > 3, ended
 
 
-def test_thousand_damaged_files(robustness):
-    ended = robustness.fuzz_checkpoints(1000)
+def test_hundreds_of_damaged_files(robustness):
+    ended = robustness.fuzz_checkpoints(300)
     refused = ended["agent.safetensors refused"], ended["training_state.pt refused"]
-    assert sum(ended.values()) == 1000 and min(refused) > 100 and sum(refused) < 1000, ended
+    assert sum(ended.values()) == 300 and min(refused) > 30 and sum(refused) < 300, ended
 
 
-def test_thousand_actions(robustness):
-    ended = robustness.fuzz_actions(1000)
-    assert sum(ended.values()) == 1000 and min(ended.values()) > 100, ended
+def test_hundreds_of_actions(robustness):
+    ended = robustness.fuzz_actions(300)
+    assert sum(ended.values()) == 300 and min(ended.values()) > 30, ended
 
 
 def test_flight_of_weights_that_overflow(robustness, tmp_path, monkeypatch, capsys):

@@ -157,30 +157,6 @@ def test_replanning_the_nominal_flight_loses_nothing():
     assert flown["final_mass_kg"][0] == pytest.approx(rocket_reference(CUTOFF)["reference_mass_kg"], abs=0.1)
 
 
-def test_replanning_meets_what_the_replay_misses(monkeypatch):
-    """A flight with less thrust and more drag; the plans are for the vehicle that the law believes in."""
-    monkeypatch.setattr(guidance, "REPLAN_EVERY", 100.0)
-    z = np.zeros((1, SCORES))
-    z[0, [2, 5, SCORES - 3]] = -2.0, -2.0, 2.0
-    seen, solve = [], guidance.optimise_remaining
-
-    def spy(rocket, rest, guess, intervals):
-        seen.append((rest.begin, rest.thrust[0], rest.flow[0], rest.air))
-        return solve(rocket, rest, guess, intervals)
-
-    monkeypatch.setattr(guidance, "optimise_remaining", spy)
-    assert (
-        ends(guidance.Replanning(CUTOFF), z)["error_norm"][0]
-        < 2e-3
-        < 5e-3
-        < ends(guidance.open_loop(CUTOFF), z)["error_norm"][0]
-    )
-    assert [begin for begin, *_ in seen] == [300.0, 400.0, 500.0, 600.0, 700.0, 800.0, 900.0]
-    assert {what for _, *what in map(tuple, seen) for what in [tuple(what)]} == {
-        (110094.0, 16820 / 700, (1.0, 0.0, 0.0))
-    }
-
-
 def flying(law, z, step=0, lost=0.0):
     """Flights with the draws z (m, k) whose last stages lose a part of thrust and flow at the begin of a step.
 
@@ -372,9 +348,9 @@ def test_a_policy_on_other_draws_is_refused(monkeypatch):
 
 def test_report(compared):
     folder, flown, reached = compared
-    report = json.loads((folder / "opponents.json").read_text())
+    laws = json.loads((folder / "opponents.json").read_text())["laws"]
     counts = []
-    for (name, law), masses in zip(report["laws"].items(), reached, strict=True):
+    for (name, law), masses in zip(laws.items(), reached, strict=True):
         errors = np.linalg.norm(flown.arrays[name]["final_error"], axis=1)
         assert law["dispersed_starts"] == len(errors) and law["first"]["dispersed_starts"] == 3
         assert law["dispersed_error_max"] == errors.max() and law["first"]["dispersed_error_max"] == errors[:3].max()
@@ -384,25 +360,19 @@ def test_report(compared):
         shares = (flown.arrays[name]["final_y"][:3, 6] / masses)[counted]
         assert law["share_reached_mean"] == pytest.approx(shares.mean(), rel=1e-12) and shares.max() < 1.0001
     assert counts[:4] == [1, 2, 2, 3]  # what is no success, or has no optimum, is left out: not all count alike
-    laws = report["laws"]
     assert laws["policy"]["knows"] == "draws in training, the draw itself"
     assert laws["optimum"]["share_target_mean"] == pytest.approx(1, abs=1e-4)
-    masses = [optimum["final_mass"] for optimum in flown.optima]
-    share = flown.arrays["tvlqr"]["final_y"][:3, 6] / masses
+    share = flown.arrays["tvlqr"]["final_y"][:3, 6] / [optimum["final_mass"] for optimum in flown.optima]
     assert laws["tvlqr"]["share_target_mean"] == pytest.approx(share.mean())
     for name in comparison.REPLANS:
         assert laws[name]["solves"] == 9 and laws[name]["decision_us"] > 1000 > laws["replay"]["decision_us"] > 0
-    lines = comparison.table(report).splitlines()
-    assert len(lines) == 2 + 10 + 5 + 2 + 4 and "replan_hint: 9 solves" in lines[-1]
-    (line,) = [line for line in lines if line.startswith("  tvlqr  ")]
-    assert f"{laws['tvlqr']['dispersed_error_median']:.6f}" in line and f"{share.mean():.3%}" in line
     assert (folder / "figures" / "opponents.png").stat().st_size > 10_000
 
 
 @pytest.mark.parametrize(
     "argv, line",
     [
-        (["{missing}"], "No such file"),
+        (["{missing}"], "eval.json is not there"),
         (["{fixed}"], "the env_id of .* is RocketAscent-v0; it must be a rocket's with cut-off"),
         (["{good}", "--starts=9"], "'9' must be a whole number from 10 to 100000"),
         (["{good}", "--starts=20", "--solved=21"], "--solved is 21; it must be at most 20, as --starts is"),

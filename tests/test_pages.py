@@ -168,14 +168,6 @@ def test_a_failure_is_a_table_with_another_burn(group, time, share):
 
 
 @pytest.mark.slow
-def test_a_failure_of_the_last_moment_changes_nothing_before():
-    late = {**NO_CHANGES, "failure": {"time": 924.1, "group": 3, "share": 0.3}}
-    healthy, failed = (flights_of("rocket_cutoff", changes)["openLoop"] for changes in (NO_CHANGES, late))
-    np.testing.assert_allclose(failed["y"][-2], healthy["y"][-2], rtol=1e-12)
-    assert failed["t"][-1] > healthy["t"][-1] + 0.01
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("payload, end", [(1200.0, "dry"), (2500.0, "crashed")])
 def test_flights_that_fail(payload, end):
     """Too heavy: it runs out of fuel, or falls; as in Python."""
@@ -316,12 +308,6 @@ def test_arrays_arrive_as_they_are():
     for name, array in written.items():
         values = engine(f"Array.from(read.of[0].{name}.values)")
         np.testing.assert_array_equal(np.reshape(values, array.shape), array.astype(float))
-
-
-def test_the_error_function():
-    x = np.linspace(-7, 7, 281)
-    found = engine_of("di")(f"{x.tolist()}.map(erf)")
-    np.testing.assert_allclose(found, [math.erf(value) for value in x], rtol=1e-14, atol=0)
 
 
 @pytest.mark.parametrize("result", [*ROCKET_RESULTS, *PLANE_RESULTS])

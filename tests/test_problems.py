@@ -545,3 +545,15 @@ def test_a_file_that_fails_is_left_out_with_one_line(tmp_path):
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0 and done.stdout.strip() == ""
     assert re.fullmatch(r"problems/mine.py is left out: env_id is 'Mine'; .*\n", done.stderr)
+
+
+@pytest.mark.slow
+def test_brachistochrone(new_problem):
+    """From (0, 10) to (10, 5) without friction: 1.8016 s. The control is the angle from straight down."""
+    phase = Phase(200, (None, 5.0, None), 1e-5, bonus=10.0, running=lambda x, u: 1.0, end=lambda x: 10 - x[0])
+    fall = lambda x, u: (x[2] * np.sin(u), -x[2] * np.cos(u), G * np.cos(u))  # noqa: E731
+    table = {"x0": (0.0, 10.0, 0.0), "guess": lambda x: 0.9}
+    problem = Problem("Brachistochrone-v0", fall, np.pi, (phase,), (50.0, 50.0, 50.0), 0.02, 0.0, **table)
+    flight, finer = optimum(problem, new_problem)
+    assert flight["final_time"][0] == pytest.approx(1.8016, abs=1e-4)
+    assert finer["finer_collocation_cost_mean"] == pytest.approx(1.8016, abs=5e-5)

@@ -238,8 +238,7 @@ def test_the_stored_optima_fit_today(env_id, failure, failure_time):
 def test_the_command_prints_and_gives_what_is_stored(monkeypatch, capsys, tmp_path):
     """By engines; the file that it writes is found by an evaluation of the same flights."""
     z = draws(ROCKET, 1.0, 3, 40, 0.2)
-    vehicles = envs.draw_vehicles(ROCKET, 1.0, z, 0.2)
-    group = vehicles.failure[0]
+    group = envs.draw_vehicles(ROCKET, 1.0, z, 0.2).failure[0]
     mass = np.where(group == 3, 6000.0, 7000.0)
 
     def failing_optima(env_id, mission, failing, rows, processes=None):
@@ -248,17 +247,13 @@ def test_the_command_prints_and_gives_what_is_stored(monkeypatch, capsys, tmp_pa
         return [{"final_mass": value, "orbit_price": np.zeros(5)} for value in chosen]
 
     monkeypatch.setattr(rescue, "failing_optima", failing_optima)
-    path = tmp_path / "mine.npz"
-    argv = ["baselines.py", CUTOFF, "--failure=0.2", "--dispersion=1", "--starts=40", "--seed=3", f"--npz={path}"]
-    monkeypatch.setattr("sys.argv", argv)
+    argv = [CUTOFF, "--failure=0.2", "--dispersion=1", "--starts=40", "--seed=3", f"--npz={tmp_path / 'mine.npz'}"]
+    monkeypatch.setattr("sys.argv", ["baselines.py", *argv])
     baselines.main()
     rows = {line[:30].strip(): line[30:].split() for line in capsys.readouterr().out.splitlines()[2:]}
-    names = ["all", "6 until 75.2 s", "3 until 150.4 s", "1 until 261 s", "1 until 961 s"]
-    assert list(rows) == names
     counts = [int((group == g).sum()) for g in range(4)]
-    assert [int(rows[name][0]) for name in names] == [sum(counts), *counts]
-    assert [int(rows[name][2]) for name in names] == [sum(counts[:3]), *counts[:3], 0]
-    assert rows["1 until 961 s"][3:] == ["6000", "6000"]
+    assert [int(row[0]) for row in rows.values()] == [sum(counts), *counts]
+    assert [int(row[2]) for row in rows.values()] == [sum(counts[:3]), *counts[:3], 0]
     monkeypatch.setattr(rescue, "STORED", tmp_path)
     found = rescue.stored_optima(rescue.about(CUTOFF, ROCKETS[CUTOFF], Failing(1.0, 0.2), 3), 40)
     np.testing.assert_array_equal(found.mass, np.where(group < 0, np.nan, mass))
@@ -335,25 +330,19 @@ def test_no_flight_ends_heavier_than_the_optimum_that_knows(flown):
 
 @pytest.mark.slow
 def test_the_saved_flight_that_burns_longest_is_kept(flown):
-    """Flown alone it ends as it did among the others; the animation marks what it lost and its own stagings."""
+    """Flown alone it ends as it did among the others; the animation marks its own stagings."""
     _, metrics, arrays = flown
-    errors = np.linalg.norm(arrays["final_error"], axis=1)
     known = rescue.known_optima(CUTOFF, ROCKETS[CUTOFF], PROTOCOL, 7, FLIGHTS)
     vehicles = envs.draw_vehicles(ROCKET, 1.0, arrays["draw"], 0.3)
+    errors = np.linalg.norm(arrays["final_error"], axis=1)
     saved = (known.mass > vehicles.dry_mass) & (errors < 0.02) & (arrays["failure"][:, 0] >= 0)
     k = int(arrays["saved"])
     assert saved[k] and arrays["t_saved"][-1] == arrays["final_t"][k] == arrays["final_t"][saved].max()
     np.testing.assert_allclose(arrays["y_saved"][-1, :6], arrays["final_y"][k, :6], rtol=1e-9)
-
     animation = task_of(CUTOFF).animation(arrays, metrics)
     animation.frame(len(animation.times) - 1)
     ends = [float(label.get_text().split()[0]) for label in animation.sheet.labels[:3]]
-    assert ends == [round(end) for end in vehicles.burn_end[:3, k]] and animation.sheet.cross.get_visible()
-    _, moment, share = arrays["failure"][k]
-    text = animation.sheet.failed.get_text()
-    assert text.strip().startswith(f"{moment:.0f} s: ") and f" {share:.0%} of thrust" in text
-    animation.frame(0)
-    assert not animation.sheet.cross.get_visible() and not animation.sheet.failed.get_visible()
+    assert ends == [round(end) for end in vehicles.burn_end[:3, k]]
 
 
 def test_failures_without_dispersion_have_no_dispersed_statistics(no_solves):
@@ -479,7 +468,7 @@ def compared(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_opponents_meet_the_same_failures(compared, capsys):
+def test_opponents_meet_the_same_failures(compared):
     folder, flown = compared
     report = json.loads((folder / "opponents_at_ignition.json").read_text())
     assert (report["failure"], report["failure_time"]) == (0.2, "ignition")
@@ -490,22 +479,13 @@ def test_opponents_meet_the_same_failures(compared, capsys):
         np.testing.assert_array_equal(flown.arrays[name]["draw"], z[:n])
         assert law["failure_starts"] == has_failed[:n].sum() and law["dispersed_starts"] == (~has_failed[:n]).sum()
         assert law["first"]["failure_starts"] == has_failed[:5].sum()
-        assert law.get("share_target_flights", 0) <= (~has_failed[:5]).sum()
+        savable = [rows[name]["savable"] for label, rows in report["by_loss"].items() if " to " in label]
+        assert sum(savable) == law["failure_savable"]
     best = report["laws"]["optimum"]
     assert best["failure_saved_rate"] == 1 and best["failure_error_p95"] < 2e-3
     assert best["failure_mass_short_mean_kg"] < report["laws"]["tvlqr_energy"]["failure_mass_short_mean_kg"]
-    lines = comparison.table(report).splitlines()
-    heading = "Flights with a failure, up to 20% of thrust lost from the last stage's ignition on"
-    row = lines[lines.index(heading) + 1 + len(report["laws"])].split()
-    assert row[0] == "optimum" and row[3] == "100.0%"
-    by_loss = report["by_loss"]
-    assert list(by_loss) == ["0", "0% to 5%", "5% to 10%", "10% to 20%", "above 15%"]
-    for name, law in report["laws"].items():
-        savable = [rows[name]["savable"] for label, rows in by_loss.items() if " to " in label]
-        assert sum(savable) == law["failure_savable"]
-        assert by_loss["0"][name]["savable"] == law["dispersed_starts"]
-    assert lines[-len(report["laws"]) - 1].startswith("  above 15% lost")
-    assert (folder / "figures" / "opponents_at_ignition_by_loss.png").stat().st_size > 10_000
+    with np.load(folder / "opponents_at_ignition.npz") as file:
+        np.testing.assert_array_equal(np.isfinite(file["best_mass_kg"]), has_failed | (np.arange(10) < 5))
 
 
 @pytest.mark.parametrize(

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import spiceypy
-from rocket_oracle import MU, PAPER, RE, both, rotation
+from rocket_oracle import MU, RE, rotation
 
-from envs import ROCKET, ROCKETS, launch_raan, orbital_elements, target_axes, target_orbit, terminal_error
+from envs import ROCKET, launch_raan, orbital_elements, target_axes, target_orbit, terminal_error
 
 # --- orbital elements -------------------------------------------------------------------------------------------------
 
@@ -112,36 +112,9 @@ def test_elements_of_parabolic_and_rectilinear_states_are_defined():
 
 
 def test_target_orbit_is_the_benchmarks():
-    v = PAPER
     h, e = target_orbit()
     np.testing.assert_allclose(h / math.sqrt(MU * RE), (-0.6365358, 0.0022219, 1.1723603), rtol=0, atol=6e-8)
     np.testing.assert_allclose(e, (0.4900165, 0.4729090, 0.2651594), rtol=0, atol=6e-8)
-    for anomaly in (0.0, 1.0, 2.5, 6.0):
-        state = spice_state(*v.goal, anomaly)
-        np.testing.assert_allclose(np.cross(state[:3], state[3:]), h, rtol=1e-11, atol=1e-11 * v.goal_h)
-        of_state = np.cross(state[3:], np.cross(state[:3], state[3:])) / MU - state[:3] / np.linalg.norm(state[:3])
-        np.testing.assert_allclose(of_state, e, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(target_axes(), v.plane.T, rtol=0, atol=1e-15)
-
-
-@both
-def test_terminal_error_is_zero_on_the_target_orbit_only(v):
-    anomalies, rocket = np.linspace(0, 6, 13), ROCKETS[v.cutoff].rocket
-    for anomaly in anomalies:
-        assert np.abs(terminal_error(v.on_goal_orbit(anomaly), rocket)).max() < 1e-12
-        assert np.abs(terminal_error(spice_state(*v.goal, anomaly), rocket)).max() < 1e-12
-        for changed in range(5 if v.e else 4):  # a circle has no perigee
-            for sign in (-1, 1) if v.e or changed != 1 else (1,):
-                elements = list(v.goal)
-                elements[changed] += sign * (1e-5 * v.goal[0] if changed == 0 else 1e-5)
-                error = terminal_error(spice_state(*elements, anomaly), rocket)
-                assert error.shape == (6,) and 1e-6 < np.linalg.norm(error) < 1e-4
-    # the formula, at a state far away, in a batch, with a mass that does not count
-    s = np.array([7e6, 1e6, -2e6, 1e3, 6e3, 3e3, 5e3])
-    h = np.cross(s[:3], s[3:6])
-    e = np.cross(s[3:6], h) / MU - s[:3] / math.sqrt(54e12)
-    expected = [*(h / v.goal_h - v.plane[:, 2]), *(e - v.e * v.plane[:, 0])]
-    np.testing.assert_allclose(terminal_error(np.array([[s, s]]), rocket), [[expected] * 2], rtol=1e-12, atol=1e-14)
 
 
 # --- targets of every shape -------------------------------------------------------------------------------------------

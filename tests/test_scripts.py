@@ -1228,6 +1228,9 @@ def foreign_state(kind, trained, folder):
     path = folder / "training_state.pt"
     if kind == "truncated":
         path.write_bytes(whole[: len(whole) // 2])
+    elif kind == "one bit":  # of a weight; torch checks no sum
+        at = whole.index(state["agent"]["encoder.0.weight"].numpy().tobytes())
+        path.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])
     elif kind == "runs code":
         path.write_bytes(pickle.dumps({**state, "progress": RunsCode()}, protocol=2))
     elif kind == "runs code, torch's format":
@@ -1241,7 +1244,7 @@ def foreign_state(kind, trained, folder):
         torch.save(kinds[kind], path)
 
 
-STATES = ["missing", "truncated", "runs code", "runs code, torch's format", "a dict"]
+STATES = ["missing", "truncated", "one bit", "runs code", "runs code, torch's format", "a dict"]
 STATES += ["without weights", "of another size"]
 
 

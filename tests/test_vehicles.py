@@ -219,17 +219,6 @@ def test_a_stage_that_is_dropped_early_takes_its_propellant_along():
         assert masses[69] == pytest.approx(start - burnt - 22e3 - unburnt, abs=1e-6)
 
 
-def test_a_tank_for_several_engines_flies_nominally_and_is_not_drawn():
-    """Nine engines, of which four stop early, hold out longer than each with a tank of its own."""
-    ninth = Engine(total_mass=433e3 / 9, propellant=411e3 / 9, thrust=7.6e6 / 9, isp=306.0, burn_time=162.0)
-    burns = (Burn(120.0, ((9, ninth),)), Burn(190.0, ((5, ninth),), ((9, ninth),)), Burn(583.0, ((1, SECOND),)))
-    rocket = replace(TWO, burns=burns, end_time=583.0)
-    register_rocket("Nine-v0", rocket)
-    gym.make_vec("Nine-v0", num_envs=1)
-    with pytest.raises(BadInput, match=r"burns\[1\].end is 190.0; it cannot be drawn: .* burn until 162 s"):
-        gym.make_vec("Nine-v0", num_envs=1, dispersion=1.0)
-
-
 @pytest.mark.parametrize("first, later", [((3, 100.0, 2), 250.0), ((2, 120.0, 0), 200.0)])
 def test_engines_that_share_a_tank_never_burn_what_was_dropped(first, later):
     """Two of three cores dropped early, and two of five lit first: what burns and what leaves is what was loaded."""
@@ -326,7 +315,7 @@ def test_a_bad_file_of_vehicles_is_left_out_with_a_line(tmp_path):
     assert second.startswith("vehicles/b_foreign.py is left out: env_id is 'VanDerPol-v0'")
     assert third == "vehicles/c_broken.py is left out: NameError: name 'heavy' is not defined"
     assert fourth == "vehicles/d_ends.py is left out: SystemExit: 2"
-    allowed = "env_id is 'TwoStageLEO-v0', another rocket's; it must be new"
+    allowed = "env_id is 'TwoStageLEO-v0', which vehicles/z_good.py has already; it must be new"
     assert copy == f"vehicles/zz_copy.py is left out: {allowed}"
 
 
@@ -440,33 +429,25 @@ def test_evaluation_is_against_the_rocket_that_flies(monkeypatch, option):
 @pytest.mark.parametrize("e", [0.0, 0.1])
 def test_equatorial_targets_are_measured_from_the_x_axis(i, sense, e):
     """By CSPICE's state on an orbit whose perigee is 30 degrees from the x axis in the direction of flight, 50 of the
-    target's: neither node nor, on a circle, perigee have an error; what the elements mean is one number."""
+    target's: neither node nor, on a circle, perigee have an error."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         rocket = replace(ROCKET, a=8e6, e=e, i=i, raan=sense * 20.0, argp=30.0)
-    mission = envs.Mission(rocket, cutoff=True)
     conic = [8e6 * (1 - 0.1), 0.1, math.radians(i), 0.0, math.radians(30), 1.0, 0, MU]
     state = np.append(spiceypy.conics(conic, 0), 5e3)
     elements = envs.orbital_elements(state)
-    error = envs.terminal_error(state, rocket)
-    flight = {"error_norm": np.linalg.norm(error), "a_km": elements.a / 1e3, "e": elements.e}
+    flight = {"error_norm": np.linalg.norm(envs.terminal_error(state, rocket)), "a_km": elements.a / 1e3}
+    flight |= {"e": elements.e, "crashed": False, "y": state[None], "t": np.ones(1), "final_mass_kg": 5e3}
     flight |= {f"{name}_deg": math.degrees(getattr(elements, name)) for name in ("i", "raan", "argp")}
-    flight |= {"final_mass_kg": 5e3, "final_time_s": 1.0, "max_altitude_km": 1.0, "episodic_return": 0.0, "points": 0.0}
-    flight |= dict.fromkeys(envs.RocketVectorEnv.PARTS, 0.0) | {"crashed": False, "y": state[None], "t": np.ones(1)}
-    reference = flight | {"reference_mass_kg": 1.0, "reference_time_s": 1.0, "nine_pitch_error_norm": 1.0}
-    metrics = {"env_id": LEO, "eval_seed": 0} | rocket_metrics(flight, reference, mission)
+    rest = ("final_time_s", "max_altitude_km", "episodic_return", "points", *envs.RocketVectorEnv.PARTS)
+    flight |= dict.fromkeys((*rest, "reference_mass_kg", "reference_time_s", "nine_pitch_error_norm"), 1.0)
+    metrics = rocket_metrics(flight, flight, envs.Mission(rocket, cutoff=True))
     assert "raan_error_deg" not in metrics and ("argp_error_deg" in metrics) == (e > 0)
     assert metrics["i_error_deg"] == pytest.approx(0, abs=1e-9) and metrics["a_error_km"] == pytest.approx(0, abs=1e-6)
     assert metrics["argp_deg"] == pytest.approx(30)
-    table = rocket_table(metrics, mission)
-    (row,) = (line for line in table.splitlines() if "perigee from the x axis" in line)
     if e:
         assert metrics["argp_error_deg"] == pytest.approx(30 - 50)
         assert metrics["error_norm"] == pytest.approx(2 * 0.1 * math.sin(math.radians(10)), rel=1e-6)
-    else:
-        assert row.split()[-4:] == ["-"] * 4
-    (row,) = (line for line in table.splitlines() if "ascending" in line or "of the node" in line)
-    assert row.split()[-4:] == ["-"] * 4
 
 
 def test_mass_for_an_equatorial_orbit_reached_is_of_its_perigee(monkeypatch):

@@ -1,7 +1,8 @@
-"""agent.safetensors in bfloat16, against torch's own rounding."""
+"""The ground: agent.safetensors in bfloat16 against torch's own rounding, and jobs that are shared out."""
 
 import hashlib
 import json
+import os
 import shutil
 import types
 from pathlib import Path
@@ -12,7 +13,9 @@ import safetensors.torch
 import torch
 
 import evaluate
+from common import ipopt
 from common.checkpoints import LARGE, read_checkpoint, write_bfloat16
+from common.workers import Workers
 
 ROOT = Path(__file__).parent.parent
 
@@ -73,3 +76,27 @@ def test_a_shorter_policy_flies_the_starts_of_its_run(tmp_path, monkeypatch):
         evaluate.shorten(run)
     assert {"--eval-seed=273427", "--eval-starts=7", "--dispersion=1.0", "--failure=0.2"} <= set(flown)
     assert "--navigation-noise=10.0 0.1" in flown
+
+
+def about(job):
+    """A job's square, who did it, and that process's limit of a solve."""
+    return job**2, os.getpid(), ipopt.limit["seconds"]
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_jobs_come_back_in_order(number, monkeypatch):
+    monkeypatch.setitem(ipopt.limit, "seconds", 7)
+    with Workers(number) as workers:
+        for jobs in ([], [3], list(range(21))):
+            done = workers.map(about, jobs)
+            assert [square for square, *_ in done] == [job**2 for job in jobs]
+            assert all(limit == 7 for *_, limit in done)
+    here = {process == os.getpid() for _, process, _ in done}
+    assert here == {number == 1}
+
+
+def test_closed_workers_do_nothing_more():
+    workers = Workers(2)
+    workers.close()
+    with pytest.raises(RuntimeError, match="after shutdown"):
+        workers.map(about, [1])
