@@ -90,9 +90,8 @@ def flight_columns(task: RocketTask, arrays: dict, metrics: dict) -> dict[str, n
 
 def track_of(name: str, rocket: Rocket, arrays: dict) -> Track:
     """The track of the nominal flight."""
-    begins = [0.0, *(burn.end for burn in rocket.burns[:-1])]
     end = arrays["t"][-1]
-    burns = zip(begins, rocket.burns)
+    burns = zip(rocket.ignitions, rocket.burns)
     events = [
         (begin, "coast" if burn.is_coast else f"burn {k}") for k, (begin, burn) in enumerate(burns, 1) if begin < end
     ]

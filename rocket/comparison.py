@@ -223,12 +223,8 @@ class Comparison:
     def best(self) -> Known:
         """`known`, where the healthy flights among the first ones have what their own optimum leaves."""
         known = Known(*(values.copy() for values in self.known()))
-        is_healthy = self.vehicles(self.draws(self.solved)).failure[0] < 0
-        for k in np.flatnonzero(is_healthy):
-            optimum = self.optima[k]
-            if optimum:
-                known.mass[k] = optimum["final_mass"]
-                known.price[k] = optimum["orbit_price"]
+        flights = np.flatnonzero(self.vehicles(self.draws(self.solved)).failure[0] < 0)
+        known.note(flights, [self.optima[k] for k in flights])
         return known
 
     def flights_by_loss(self) -> dict:

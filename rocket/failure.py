@@ -72,7 +72,7 @@ def no_losses(groups, n: int) -> Losses:
     return Losses(np.full((len(groups), n), np.inf), np.zeros((len(groups), n)))
 
 
-def failing_groups(rocket: Rocket, failure_time: str = "random") -> list[int]:
+def failing_groups(rocket: Rocket, failure_time: str) -> list[int]:
     """The groups that may fail, as indices of `engine_groups`: all with thrust, or only the last with "ignition"."""
     with_thrust = [g for g, group in enumerate(engine_groups(rocket)) if group.burns and group.engine.thrust]
     return with_thrust if failure_time == "random" else with_thrust[-1:]

@@ -8,11 +8,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Rectangle
-from scipy.stats import binomtest
 
 from drawing.style import BOUNDARY, OPTIMUM, POLICY, TARGET, TARGET_ORBIT
 from rocket.losses import STANDARD
-from rocket.metrics import BOX, altitude_km, element_misses
+from rocket.metrics import BOX, altitude_km, element_misses, wilson
 from rocket.missions import Mission
 from rocket.orbits import final_elements, local_frame, orbit_vectors, target_axes, target_orbit
 from rocket.vehicle import Rocket
@@ -241,7 +240,7 @@ def losses_figure(report: dict, title: str) -> Figure:
         rows = [(place + aside, report[label][name]) for label, place in places.items()]
         saved = [(x, row["saved"], row["savable"]) for x, row in rows if row["savable"]]
         if saved:
-            bounds = np.array([binomtest(hits, flights).proportion_ci(method="wilson") for _, hits, flights in saved])
+            bounds = np.array([wilson(hits, flights) for _, hits, flights in saved])
             rate = np.array([hits / flights for _, hits, flights in saved])
             share.errorbar([x for x, *_ in saved], 100 * rate, 100 * np.abs(bounds.T - rate), **style)
         pairs = [(x, row["against"]) for x, row in rows if "mass_kg" in row.get("against", {})]

@@ -170,7 +170,7 @@ def tracked(mission: Mission, flight: dict) -> Tracked:
     # the last step is cut short, so its own gain is far too large for a whole step
     gains[-1] = gains[-2]
     axes[-1] = axes[-2]
-    ignition = int(np.searchsorted(flight["t"], mission.rocket.last_ignition))
+    ignition = int(np.searchsorted(flight["t"], mission.rocket.ignitions[-1]))
     energy = np.maximum.accumulate(specific_energy(y[ignition:].T, mission.rocket.mu))
     return Tracked(y, u, gains, axes, ignition, energy)
 

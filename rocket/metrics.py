@@ -246,11 +246,13 @@ def element_misses(flights: dict, rocket: Rocket) -> dict:
 
 def box_rate(inside: int, n: int) -> dict:
     """The share of n flights inside the launcher's accuracy, and its Wilson interval at 95 % confidence."""
+    low, high = wilson(inside, n)
+    return {"dispersed_box_rate": inside / n, "dispersed_box_low": low, "dispersed_box_high": high}
+
+
+def wilson(hits: int, n: int) -> tuple[float, float]:
+    """The Wilson interval of the share of hits among n, at 95 % confidence."""
     from scipy.stats import binomtest
 
-    interval = binomtest(inside, n).proportion_ci(0.95, method="wilson")
-    return {
-        "dispersed_box_rate": inside / n,
-        "dispersed_box_low": float(interval.low),
-        "dispersed_box_high": float(interval.high),
-    }
+    interval = binomtest(hits, n).proportion_ci(0.95, method="wilson")
+    return float(interval.low), float(interval.high)

@@ -170,6 +170,13 @@ class Known(NamedTuple):
         """The same for the first n flights."""
         return Known(*(values[:n] for values in self))
 
+    def note(self, flights, optima: list):
+        """Set the numbers of these flights by their optima. A flight without one keeps its numbers."""
+        for k, optimum in zip(flights, optima):
+            if optimum:
+                self.mass[k] = optimum["final_mass"]
+                self.price[k] = optimum["orbit_price"]
+
     def mass_at(self, error: np.ndarray, rocket: Rocket) -> np.ndarray:
         """The masses (n,) in kg for the orbits with these terminal errors (n, 6), to first order.
 
@@ -185,10 +192,7 @@ def solve_known(env_id: str, mission: Mission, failing: Failing, z: np.ndarray) 
     vehicles = failing.vehicles(mission.rocket, z)
     has_failed = np.flatnonzero(vehicles.failure[0] >= 0)
     known = Known(np.full(len(z), np.nan), np.full((len(z), 5), np.nan))
-    for k, optimum in zip(has_failed, failing_optima(env_id, mission, failing, z[has_failed])):
-        if optimum:
-            known.mass[k] = optimum["final_mass"]
-            known.price[k] = optimum["orbit_price"]
+    known.note(has_failed, failing_optima(env_id, mission, failing, z[has_failed]))
     return known
 
 
