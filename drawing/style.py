@@ -16,6 +16,7 @@ SHOWN = 10  # the paper shows ten starts
 POLICY = {"color": "tab:red", "linewidth": 1.6, "linestyle": "-"}
 OPTIMUM = {"color": "tab:blue", "linewidth": 1.0, "linestyle": (0, (4, 2))}
 TARGET = {"color": "tab:green", "linewidth": 1.5}
+TARGET_ORBIT = {**TARGET, "linewidth": 4.0, "alpha": 0.4}  # beneath the lines of flights
 BOUNDARY = {"color": "0.5", "linewidth": 0.8, "linestyle": ":"}
 
 

@@ -7,6 +7,8 @@ import io
 
 import numpy as np
 
+STATE = ("x_m", "y_m", "z_m", "vx_m_s", "vy_m_s", "vz_m_s", "mass_kg")  # of a vehicle
+
 
 def csv_bytes(columns: dict[str, np.ndarray]) -> bytes:
     """The file of columns (rows,) by name. Numbers are read back exactly, to the last bit. A NaN is an empty cell."""
@@ -39,6 +41,12 @@ def stacked(columns: dict[str, np.ndarray], lives: np.ndarray) -> dict[str, np.n
     """The flights in one table: the rows of columns (n, rows) where `lives` (n, rows), with the flight's number."""
     flight = np.broadcast_to(np.arange(len(lives))[:, None], lives.shape)
     return {"flight": flight[lives], **{name: column[lives] for name, column in columns.items()}}
+
+
+def last_living(rows: np.ndarray) -> np.ndarray:
+    """The last row (n, k) of rows (n, T, k) that is not NaN."""
+    last = np.isfinite(rows).all(axis=2).sum(axis=1) - 1
+    return rows[np.arange(len(rows)), last]
 
 
 def held(controls: np.ndarray) -> np.ndarray:

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from exports.columns import held, named, stacked
+from exports.columns import STATE, held, last_living, named, stacked
 from exports.offers import Interface
 from landing.task import LanderTask
 
-POSITION = ("x_m", "y_m", "z_m")
-VELOCITY = ("vx_m_s", "vy_m_s", "vz_m_s")
-STATE = (*POSITION, *VELOCITY, "mass_kg")
 THRUST = ("thrust_x_N", "thrust_y_N", "thrust_z_N")
 GRAVITY = ("gravity_x_m_s2", "gravity_y_m_s2", "gravity_z_m_s2")
 EFFECTIVENESS = ("effectiveness_x", "effectiveness_y", "effectiveness_z")
@@ -73,9 +70,3 @@ def flight_columns(task: LanderTask, arrays: dict, metrics: dict) -> dict[str, n
         "fuel_kg": arrays["fuel_kg"],
         "fuel_of_optimum_kg": reference,
     }
-
-
-def last_living(rows: np.ndarray) -> np.ndarray:
-    """The last row (n, k) of rows (n, T, k) that is not NaN."""
-    last = np.isfinite(rows).all(axis=2).sum(axis=1) - 1
-    return rows[np.arange(len(rows)), last]

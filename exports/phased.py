@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from exports.columns import held, named, numbered, stacked
+from exports.columns import held, last_living, named, numbered, stacked
 from exports.offers import Interface
 from exports.phased_page import page
 from phased.problem import Problem
@@ -76,13 +76,12 @@ def flight_columns(task: PhasedTask, arrays: dict, metrics: dict) -> dict[str, n
     """The columns with a row for each flight: start, end, cost, and the optimum's cost from the same start."""
     problem = task.problem
     x = arrays["x"]
-    last = np.isfinite(x).all(axis=2).sum(axis=1) - 1
     names = state_names(problem)
     columns = {"flight": np.arange(len(x))}
     if "draw" in arrays:
         columns |= named(numbered("score", problem.scores), arrays["draw"])
     columns |= named([f"{name}_start" for name in names], x[:, 0])
-    columns |= named([f"{name}_end" for name in names], x[np.arange(len(x)), last])
+    columns |= named([f"{name}_end" for name in names], last_living(x))
     if "final_time" in arrays:
         columns["t_end_s"] = arrays["final_time"]
     return columns | {"cost": arrays["cost"], "cost_of_optimum": arrays["cost_reference"]}

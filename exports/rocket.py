@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from common.errors import BadInput, refuse_unless
-from exports.columns import named
+from exports.columns import STATE, named
 from exports.offers import Interface
 from exports.rocket_page import page
 from exports.track import Track, over_ground
@@ -13,14 +13,12 @@ from rocket.comparison import recorded_flights
 from rocket.dispersion import draw_names
 from rocket.metrics import apsides
 from rocket.orbits import target_axes
+from rocket.rescue import Failing
 from rocket.task import RocketTask
 from rocket.vehicle import Rocket
 
 __all__ = ["flight_columns", "interface", "page", "step_columns", "track"]  # what this family offers
 
-POSITION = ("x_m", "y_m", "z_m")
-VELOCITY = ("vx_m_s", "vy_m_s", "vz_m_s")
-STATE = (*POSITION, *VELOCITY, "mass_kg")
 ACTIONS = {"eci": ("x", "y", "z"), "local": ("up", "along_track", "cross_track")}
 
 
@@ -68,14 +66,14 @@ def flight_columns(task: RocketTask, arrays: dict, metrics: dict) -> dict[str, n
         needs = "--flights needs one with --dispersion or --failure"
         raise BadInput(f"the evaluation of {task.env_id} holds one flight; {needs}")
     rocket = task.mission.rocket
-    failing = {key: metrics[key] for key in ("failure", "failure_time") if key in metrics}
-    flights = recorded_flights(arrays, rocket, metrics.get("dispersion", 0.0), **failing)
+    failing = Failing.of(metrics)
+    flights = recorded_flights(arrays, rocket, failing)
     scores = draw_names(rocket)
     strikes = {}
-    if failing:
+    if failing.failure:
         strikes = named(("failed_group", "failure_t_s", "thrust_lost"), arrays["failure"] + [1, 0, 0])
     orbit = {key: flights[key] for key in ("error_norm", "a_km", "e", "i_deg", "raan_deg", "argp_deg")}
-    perigee, apogee = (apsides_of(flights, rocket)[key] for key in ("perigee_km", "apogee_km"))
+    perigee, apogee = apsides(flights["a_km"], flights["e"], rocket).values()
     return {
         "flight": np.arange(len(arrays["draw"])),
         **named([f"score_{name}" for name in scores], arrays["draw"][:, : len(scores)]),
@@ -84,24 +82,16 @@ def flight_columns(task: RocketTask, arrays: dict, metrics: dict) -> dict[str, n
         **named(STATE, arrays["final_y"]),
         **orbit,
         "perigee_km": perigee,
-        "apogee_km": apogee,
+        "apogee_km": np.where(np.isfinite(apogee), apogee, np.nan),
         "dry": flights["dry"],
         "crashed": flights["crashed"],
     }
 
 
-def apsides_of(flights: dict, rocket: Rocket) -> dict:
-    """Altitudes of perigee and apogee (n,) in km. The apogee of a hyperbola is NaN."""
-    both = [apsides(a, e, rocket) for a, e in zip(flights["a_km"], flights["e"])]
-    found = {key: np.array([row[key] for row in both]) for key in ("perigee_km", "apogee_km")}
-    return {key: np.where(np.isfinite(values), values, np.nan) for key, values in found.items()}
-
-
 def track_of(name: str, rocket: Rocket, arrays: dict) -> Track:
     """The track of the nominal flight."""
-    begins = [0.0, *(burn.end for burn in rocket.burns[:-1])]
     end = arrays["t"][-1]
-    burns = zip(begins, rocket.burns)
+    burns = zip(rocket.ignitions, rocket.burns)
     events = [
         (begin, "coast" if burn.is_coast else f"burn {k}") for k, (begin, burn) in enumerate(burns, 1) if begin < end
     ]

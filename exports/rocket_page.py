@@ -15,6 +15,7 @@ from rocket.dispersion import (
     DISPERSION,
     WIND_ALTITUDE,
     WIND_DEPTH,
+    arc_masses,
     check_drawable,
     draw_names,
     draw_sigmas,
@@ -64,6 +65,7 @@ def constants(mission: Mission, dispersion: float) -> dict:
     """The constants that the page's physics reads."""
     rocket = mission.rocket
     h_target, e_target = target_orbit(rocket.target, rocket.mu)
+    nominal = draw_vehicles(rocket, 1.0, np.zeros((1, len(draw_names(rocket)))))
     return {
         **{name: getattr(rocket, name) for name in ("mu", "Re", "omega_e", "rho0", "H", "Cd", "S", "dt", "end_time")},
         **{name: getattr(rocket, name) for name in ("payload", "dry_mass", "target_energy", "body")},
@@ -82,7 +84,7 @@ def constants(mission: Mission, dispersion: float) -> dict:
             for burn in rocket.burns
         ],
         "groups": [group_constants(rocket, group) for group in engine_groups(rocket)],
-        "seen_mass": seen_mass(rocket),
+        "seen_mass": arc_masses(nominal).tolist(),  # the flight computer's mass (kg) when each burn begins
         "scores": [
             {"of": slider(name), "sigma": dispersion * sigma}
             for name, sigma in zip(draw_names(rocket), draw_sigmas(rocket))
@@ -139,12 +141,3 @@ def sliders(rocket: Rocket) -> list[dict]:
         }
         for name, label, unit, scale, sigma, step, most in rows
     ]
-
-
-def seen_mass(rocket: Rocket) -> list[float]:
-    """The flight computer's mass in kg at the beginning of each burn, which is the nominal vehicle's."""
-    nominal = draw_vehicles(rocket, 1.0, np.zeros((1, len(draw_names(rocket)))))
-    last = len(rocket.burns) - 1
-    ends, flow, dropped = (getattr(nominal, name)[:last, 0] for name in ("end", "flow", "dropped"))
-    burnt = flow * np.diff(ends, prepend=0.0)
-    return (nominal.mass[0] - np.append(0.0, np.cumsum(burnt + dropped))).tolist()

@@ -12,18 +12,15 @@ Reading order: policies, laws, table, command.
 from __future__ import annotations
 
 import json
-import os
-import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
-from common.checkpoints import read_checkpoint
 from common.errors import refuse_unless
 from common.files import write_json
-from common.policies import evaluate_by_script
+from common.policies import competitors, fly_by_script
 from landing.environment import fly_lander
 from landing.guidance import LAWS, Replanned, drdv, drdv_estimated
 from landing.lander import LANDERS, Lander, draw_flights
@@ -57,12 +54,9 @@ def fly_checkpoint(path, failure: dict, eval_seed: int, n: int) -> dict:
 
     Raises BadInput with the script's own line if the script refuses the policy.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "eval.json"
-        flags = {"eval-starts": n, "eval-seed": eval_seed, "eval-json": file, "num-threads": 1}
-        flags |= {name.replace("_", "-"): value for name, value in failure.items()}
-        evaluate_by_script(POLICY_SCRIPT, path, flags)
-        metrics = json.loads(file.read_text())
+    flags = {"eval-starts": n, "eval-seed": eval_seed}
+    flags |= {name.replace("_", "-"): value for name, value in failure.items()}
+    metrics, _ = fly_by_script(POLICY_SCRIPT, path, flags)
     kept = {key: value for key, value in metrics.items() if isinstance(value, int | float)}
     return kept | {"knows": "flights in training"}
 
@@ -208,14 +202,7 @@ def compare(
     for name, (value, default) in given.items():
         refuse_unless(value == default, f"--{name}", value, f"is no flag of {env_id}; leave it out")
     refuse_unless(solved <= n, "--solved", solved, f"must be at most --starts, {n}")
-    refuse_unless(os.access(folder, os.W_OK), "the folder", folder, "must be writable")
-    checkpoints = {"policy": folder / "agent.safetensors"}
-    for name, path in also:
-        refuse_unless(name not in {*checkpoints, *LAWS}, "the NAME of --also", name, "must be that of no other row")
-        checkpoints[name] = path
-    for path in checkpoints.values():
-        other = read_checkpoint(path, {}, flag="")["args"]["env_id"]
-        refuse_unless(other == env_id, f"the env_id of {path}", other, f"must be {env_id}, as that of {folder}")
+    checkpoints = competitors(env_id, folder, also, LAWS)
     metrics = json.loads((folder / "eval.json").read_text())
     failures = {name: metrics[name] for name in FAILURE}
     rows = {name: fly_checkpoint(path, failures, eval_seed, n) for name, path in checkpoints.items()}

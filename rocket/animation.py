@@ -9,7 +9,7 @@ from matplotlib.path import Path as Outline
 from matplotlib.transforms import Affine2D
 
 from drawing.animation import DOT, LOOKS, SIDES, Animation, Flight, Sheet, room
-from drawing.style import BOUNDARY, OPTIMUM, POLICY, TARGET
+from drawing.style import BOUNDARY, OPTIMUM, POLICY, TARGET_ORBIT
 from rocket.dispersion import Vehicles
 from rocket.orbits import orbit_vectors, orbital_elements, target_axes
 from rocket.vehicle import Rocket, engine_groups
@@ -52,9 +52,7 @@ class AscentSheet(Sheet):
         """Draw Earth and the target orbit in the target's plane, to scale, with the perigee to the right."""
         Re, a, e = self.rocket.Re, self.rocket.a, self.rocket.e
         self.orbit.add_patch(Circle((0, 0), Re, facecolor=EARTH, edgecolor="0.6", linewidth=0.6, zorder=0))
-        self.orbit.plot(
-            *self._orbit(np.concatenate(self._target_state())), **{**TARGET, "linewidth": 4.0, "alpha": 0.4}
-        )
+        self.orbit.plot(*self._orbit(self._target_state()), **TARGET_ORBIT)
         low = -a * (1 + e)
         high = max(a * (1 - e), Re)
         side = max(a * np.sqrt(1 - e * e), Re)
@@ -66,10 +64,10 @@ class AscentSheet(Sheet):
         self.orbit.text((low + high) / 2, top, caption, ha="center", va="top", fontsize=8)
         self.orbit.text(0, -0.6 * Re, self.rocket.body, ha="center", va="center", fontsize=7, color="0.4")
 
-    def _target_state(self) -> tuple[np.ndarray, np.ndarray]:
-        """r (m) and v (m/s) in ECI at the target's perigee."""
+    def _target_state(self) -> np.ndarray:
+        """r (m) and v (m/s) in ECI at the target's perigee, (6,)."""
         a, e, (perigee, ahead, _) = self.rocket.a, self.rocket.e, self.axes
-        return a * (1 - e) * perigee, np.sqrt(self.rocket.mu / a * (1 + e) / (1 - e)) * ahead
+        return np.append(a * (1 - e) * perigee, np.sqrt(self.rocket.mu / a * (1 + e) / (1 - e)) * ahead)
 
     def _draw_target_altitude(self):
         """Draw the target orbit's altitude over the downrange from the pad, for half a turn."""
@@ -77,7 +75,7 @@ class AscentSheet(Sheet):
         r = self.rocket.a * (1 - self.rocket.e**2) / (1 + self.rocket.e * np.cos(angle))
         x = (angle - self.launch) * self.rocket.Re / 1e3
         y = (r - self.rocket.Re) / 1e3
-        self.ascent.plot(x, y, **{**TARGET, "linewidth": 4.0, "alpha": 0.4})
+        self.ascent.plot(x, y, **TARGET_ORBIT)
         self.ascent.axhspan(-1e4, 0, color=EARTH, zorder=0)
 
     def _prepare_lines(self):
@@ -136,7 +134,7 @@ class AscentSheet(Sheet):
 
     def _orbit(self, y: np.ndarray) -> np.ndarray:
         """The orbit (2, n) in m, in the target's plane, on which a state y (r, v, ...) would coast; cut far out."""
-        h, e = (np.array(vector) for vector in orbit_vectors(y, self.rocket.mu))
+        h, e = np.array(orbit_vectors(y, self.rocket.mu))
         size = np.linalg.norm(e)
         along = e / size if size > 1e-9 else y[:3] / np.linalg.norm(y[:3])
         across = np.cross(h / max(np.linalg.norm(h), 1e-300), along)  # a launch from a pole begins with h = 0
@@ -252,16 +250,13 @@ def pitch_above_horizon(flight: Flight) -> np.ndarray:
 HASTE = 1.5  # time goes with this power of the share played, since the stagings come early
 
 
-def ascent_animation(rocket: Rocket, arrays: dict, title: str) -> Animation:
-    """The flight of an evaluation, policy beside optimum."""
+def ascent_animation(rocket: Rocket, arrays: dict, title: str, vehicle: Vehicles | None = None) -> Animation:
+    """The flight of an evaluation, policy beside the nominal flight's optimum.
+
+    With a drawn `vehicle` it is the vehicle's flight, which was saved and which a failure made burn longest.
+    """
+    shown = SIDES if vehicle is None else {"_saved": "saved", "_reference": "optimum"}
     sides = []
-    for suffix, name in SIDES.items():
+    for suffix, name in shown.items():
         sides.append([Flight.of(*(arrays[f"{key}{suffix}"] for key in ("t", "u", "y")), name)])
-    return Animation.of(AscentSheet(rocket, title, compared=True), sides, HASTE)
-
-
-def failure_animation(rocket: Rocket, vehicle: Vehicles, arrays: dict, title: str) -> Animation:
-    """The saved flight of an evaluation that a failure made burn longest, beside the nominal flight's optimum."""
-    policy = Flight.of(*(arrays[f"{key}_saved"] for key in ("t", "u", "y")), "saved")
-    optimum = Flight.of(*(arrays[f"{key}_reference"] for key in ("t", "u", "y")), "optimum")
-    return Animation.of(AscentSheet(rocket, title, compared=True, vehicle=vehicle), [[policy], [optimum]], HASTE)
+    return Animation.of(AscentSheet(rocket, title, compared=True, vehicle=vehicle), sides, HASTE)

@@ -10,9 +10,6 @@ Reading order: policies, all on the same draws, table, command.
 
 from __future__ import annotations
 
-import json
-import os
-import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
 from pathlib import Path
@@ -23,25 +20,23 @@ from common.checkpoints import read_checkpoint
 from common.errors import refuse_unless
 from common.files import write_json, write_npz
 from common.flying import decision_us
-from common.policies import evaluate_by_script
+from common.policies import competitors, fly_by_script
 from rocket import guidance
-from rocket.dispersion import draw_vehicles
-from rocket.failure import check_failure
+from rocket.failure import WHEN, check_failure
 from rocket.kalman import Filtered
-from rocket.losses import loss_lines, loss_report
+from rocket.losses import aligned, loss_lines, loss_report
 from rocket.metrics import (
     AT_ONCE,
     SUCCESS,
     chosen,
     dispersed_metrics,
-    draws,
     evaluate_dispersed,
     failure_metrics,
-    final_elements,
     healthy,
 )
 from rocket.missions import ROCKETS
 from rocket.navigation import checked_noise, noise_metrics
+from rocket.orbits import final_elements
 from rocket.rescue import Failing, Known, directions_at, failing_optima, known_optima
 from rocket.vehicle import Rocket
 
@@ -86,17 +81,12 @@ def fly_checkpoint(path, dispersion: float, eval_seed: int, n: int, **options):
     Raises BadInput with the script's own line if the script refuses the policy.
     """
     args = read_checkpoint(path, {}, flag="")["args"]
-    with tempfile.TemporaryDirectory() as folder:
-        files = [Path(folder) / name for name in ("eval.json", "eval.npz")]
-        flags = {"dispersion": dispersion, "eval-starts": n, "eval-seed": eval_seed}
-        flags |= {name.replace("_", "-"): flag_words(value) for name, value in options.items()}
-        flags |= {"eval-json": files[0], "eval-npz": files[1], "num-threads": 1}
-        evaluate_by_script(POLICY_SCRIPT, path, flags)
-        decision_us = json.loads(files[0].read_text())["decision_us"]
-        with np.load(files[1]) as file:
-            names = ("draw", "final_y", "final_t", "final_error", "failure")
-            arrays = {key: file[key] for key in names if key in file}
-    return arrays, {"knows": knowledge(args), "decision_us": decision_us}
+    flags = {"dispersion": dispersion, "eval-starts": n, "eval-seed": eval_seed}
+    flags |= {name.replace("_", "-"): flag_words(value) for name, value in options.items()}
+    metrics, arrays = fly_by_script(POLICY_SCRIPT, path, flags)
+    names = ("draw", "final_y", "final_t", "final_error", "failure")
+    ends = {key: arrays[key] for key in names if key in arrays}
+    return ends, {"knows": knowledge(args), "decision_us": metrics["decision_us"]}
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -167,7 +157,7 @@ class Comparison:
 
     def draws(self, n: int) -> np.ndarray:
         """The first n draws of the seed."""
-        return draws(self.rocket, self.dispersion, self.eval_seed, n, self.failing.failure)
+        return self.failing.draws(self.rocket, self.eval_seed, n)
 
     def fly(self, name: str, opponent, n: int):
         """Fly an opponent on the first n draws, and time its decisions unless it solves.
@@ -203,27 +193,21 @@ class Comparison:
         """The optima that know the draws of the first flights, to the target or to the orbits of the states `reached`.
 
         `reached` (n, 7) has the competitors one after another. They are solved in one go, because processes take
-        seconds to start. A flight with a failure has no optimum here, but None.
+        seconds to start.
         """
         z = self.draws(self.solved)
         if reached is not None:
             z = np.tile(z, (len(reached) // len(z), 1))
-        flights = np.flatnonzero(self.vehicles(z).failure[0] < 0)
-        of_reached = None if reached is None else reached[flights]
-        optima: list = [None] * len(z)
-        found = guidance.drawn_optima(self.env_id, self.dispersion, z[flights], of_reached, PROCESSES)
-        for k, optimum in zip(flights, found):
-            optima[k] = optimum
-        return optima
+        return guidance.drawn_optima(self.env_id, self.dispersion, z, reached, PROCESSES)
 
     def vehicles(self, z: np.ndarray):
         """The vehicles of draws z (n, k)."""
-        return draw_vehicles(self.rocket, self.dispersion, z, self.failing.failure, self.failing.failure_time)
+        return self.failing.vehicles(self.rocket, z)
 
     def metrics(self, name: str, n: int) -> dict:
         """The metrics of a competitor's first n flights, or of all its flights if it flew fewer."""
         arrays = {key: value[:n] for key, value in self.arrays[name].items()}
-        flights = recorded_flights(chosen(arrays, healthy(arrays)), self.rocket, self.dispersion)
+        flights = recorded_flights(chosen(arrays, healthy(arrays)), self.rocket, Failing(self.dispersion))
         starts = len(flights["error_norm"])
         metrics = {"dispersed_starts": starts} | dispersed_metrics(flights, self.rocket)
         if self.failures:
@@ -239,12 +223,8 @@ class Comparison:
     def best(self) -> Known:
         """`known`, where the healthy flights among the first ones have what their own optimum leaves."""
         known = Known(*(values.copy() for values in self.known()))
-        is_healthy = self.vehicles(self.draws(self.solved)).failure[0] < 0
-        for k in np.flatnonzero(is_healthy):
-            optimum = self.optima[k]
-            if optimum:
-                known.mass[k] = optimum["final_mass"]
-                known.price[k] = optimum["orbit_price"]
+        flights = np.flatnonzero(self.vehicles(self.draws(self.solved)).failure[0] < 0)
+        known.note(flights, [self.optima[k] for k in flights])
         return known
 
     def flights_by_loss(self) -> dict:
@@ -315,19 +295,15 @@ class Comparison:
         return report
 
 
-def recorded_flights(arrays: dict, rocket: Rocket, dispersion: float, **failing) -> dict:
-    """The flights (n,) of eval.npz's arrays, in the form that `dispersed_metrics` reads.
-
-    Flights with failures need `failure` and `failure_time` of their evaluation.
-    """
+def recorded_flights(arrays: dict, rocket: Rocket, failing: Failing) -> dict:
+    """The flights (n,) of eval.npz's arrays, in the form that `dispersed_metrics` reads."""
     y = arrays["final_y"]
-    burn_out = draw_vehicles(rocket, dispersion, arrays["draw"], **failing).burn_out
-    flights = final_elements(y, rocket) | {"final_mass_kg": y[:, 6]}
-    flights |= {
+    return final_elements(y, rocket) | {
+        "final_mass_kg": y[:, 6],
         "error_norm": np.linalg.norm(arrays["final_error"], axis=1),
-        "dry": arrays["final_t"] >= burn_out - 1e-6,
+        "dry": arrays["final_t"] >= failing.vehicles(rocket, arrays["draw"]).burn_out - 1e-6,
+        "crashed": np.linalg.norm(y[:, :3], axis=1) < rocket.Re,
     }
-    return flights | {"crashed": np.linalg.norm(y[:, :3], axis=1) < rocket.Re}
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -337,7 +313,6 @@ def recorded_flights(arrays: dict, rocket: Rocket, dispersion: float, **failing)
 COLUMNS = ("flights", "||error|| median", "p95", "max", "perigee off (km)", "in the box (95 %)", "mass (kg)")
 COLUMNS += ("of the optimum", "orbit reached", "a decision", "knows")
 WIDTHS = (7, 16, 8, 8, 16, 24, 9, 14, 14, 10, 0)
-WHEN = {"random": "from a random moment of a burn on", "ignition": "from the last stage's ignition on"}
 
 
 def table(report: dict) -> str:
@@ -354,8 +329,7 @@ def table(report: dict) -> str:
     width = max(len(row[0]) for row in rows)
     draws = f"the draws of eval seed {report['eval_seed']}, the same for all"
     lines = [f"{report['env_id']} at dispersion {report['dispersion']:g},{noise_words(report)}{about} {draws}"]
-    for name, *others in rows:
-        lines.append(f"  {name:<{width}}" + "".join(f"  {cell:>{w}}" for cell, w in zip(others, WIDTHS)))
+    lines += [aligned(f"{name:<{width}}", others, WIDTHS) for name, *others in rows]
     lines.append("  Shares: mean mass over that of the optimum that knows the draw, to the target and to the orbit")
     flights = f"of {known} flights; of fewer (in brackets) where one missed the orbit."
     lines.append(f"    that was reached, {flights}")
@@ -392,9 +366,8 @@ def failure_lines(report: dict) -> list[str]:
     for name, entry in report["laws"].items():
         rows.append([name, *(format(entry[key], form) if key in entry else "-" for key, (_, form) in columns.items())])
     width = max(len(row[0]) for row in rows)
-    for name, *others in rows:
-        cells = (f"  {cell:>{max(len(head), 8)}}" for cell, head in zip(others, rows[0][1:]))
-        lines.append(f"  {name:<{width}}" + "".join(cells))
+    widths = [max(len(head), 8) for head, _ in columns.values()]
+    lines += [aligned(f"{name:<{width}}", others, widths) for name, *others in rows]
     return lines + loss_lines(report["by_loss"])
 
 
@@ -440,16 +413,6 @@ def duration(microseconds: float | None) -> str:
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def check(env_id: str, folder: Path, n: int, solved: int, checkpoints: dict):
-    """Raise BadInput before anything is flown, if the flags do not fit a results folder of this id."""
-    refuse_unless(ROCKETS[env_id].cutoff, f"the env_id of {folder}", env_id, "must be a rocket's with cut-off")
-    refuse_unless(solved <= n, "--solved", solved, f"must be at most {n}, as --starts is")
-    for path in checkpoints.values():
-        other = read_checkpoint(path, {}, flag="")["args"]["env_id"]
-        refuse_unless(other == env_id, f"the env_id of {path}", other, f"must be {env_id}, as that of {folder}")
-    refuse_unless(os.access(folder, os.W_OK), "the folder", folder, "must be writable")
-
-
 def compare(
     env_id: str,
     folder: Path,
@@ -471,12 +434,9 @@ def compare(
     """
     check_failure(failure, failure_time, ROCKETS[env_id].cutoff)
     noise = checked_noise(navigation_noise)
-    checkpoints = {"policy": folder / "agent.safetensors"}
-    for name, path in also:
-        is_new = name not in {*checkpoints, *KNOWLEDGE, *FILTERED}
-        refuse_unless(is_new, "the NAME of --also", name, "must be that of no other row")
-        checkpoints[name] = path
-    check(env_id, folder, n, solved, checkpoints)
+    refuse_unless(ROCKETS[env_id].cutoff, f"the env_id of {folder}", env_id, "must be a rocket's with cut-off")
+    refuse_unless(solved <= n, "--solved", solved, f"must be at most {n}, as --starts is")
+    checkpoints = competitors(env_id, folder, also, {*KNOWLEDGE, *FILTERED})
     failures = {"failure": failure, "failure_time": failure_time} if failure else {}
     comparison = Comparison(env_id, dispersion, eval_seed, n, solved, noise, **failures)
     comparison.fly_policies(checkpoints)

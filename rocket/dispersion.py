@@ -285,6 +285,13 @@ def seconds_left(groups, k: int, lasting: np.ndarray, seconds_lit: np.ndarray, l
     return until_empty, until_due
 
 
+def arc_masses(vehicle: Vehicles) -> np.ndarray:
+    """The kg (A - 1,) of one vehicle when each arc begins. The last arc is left out."""
+    end, flow, dropped = (column[:-1, 0] for column in (vehicle.end, vehicle.flow, vehicle.dropped))
+    lost = flow * np.diff(end, prepend=0.0) + dropped
+    return vehicle.mass[0] - np.append(0.0, np.cumsum(lost)[:-1])
+
+
 def nominal_vehicles(rocket: Rocket, number: int) -> Vehicles:
     """`number` vehicles as the table has them. With `table_isp` propellant that a stage has not burnt stays aboard."""
     _, end, thrust, flow, dropped = np.array(rocket.arcs()).T

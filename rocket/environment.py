@@ -21,6 +21,7 @@ from common.flying import fly_until_ended
 from rocket.dispersion import (
     DISPERSION,
     LARGEST_DISPERSION,
+    arc_masses,
     check_drawable,
     draw_bounds,
     draw_names,
@@ -34,9 +35,9 @@ from rocket.missions import PAPER_MISSION, ROCKETS, Mission
 from rocket.navigation import LARGEST_SCORE as LARGEST_NOISE_SCORE
 from rocket.navigation import OBSERVED, checked_noise, deviations
 from rocket.orbits import (
+    final_elements,
     local_frame,
     orbit_vectors,
-    orbital_elements,
     specific_energy,
     target_axes,
     target_orbit,
@@ -193,10 +194,8 @@ class RocketVectorEnv(BatchedEnv):
             return
         # the flight computer's nominal mass (kg) at each burn's beginning, and each burn's flow (kg/s)
         nominal = draw_vehicles(self.rocket, self.dispersion, self.draw)
-        ends, flow, dropped = (getattr(nominal, name)[:-1, 0] for name in ("end", "flow", "dropped"))
-        burnt = flow[:-1] * np.diff(ends[:-1], prepend=0.0)
-        self._seen_mass = nominal.mass[0] - np.append(0.0, np.cumsum(burnt + dropped[:-1]))
-        self._seen_flow = flow
+        self._seen_mass = arc_masses(nominal)
+        self._seen_flow = nominal.flow[:-1, 0]
         if self.failure:
             self.draw = np.hstack([self.draw, np.tile(HEALTHY_DRAW, (self.num_envs, 1))])
         self.vehicles = self._drawn(self.draw)
@@ -298,15 +297,11 @@ class RocketVectorEnv(BatchedEnv):
             self._noise[mask] = self._noise_generator().standard_normal((int(mask.sum()), *self._noise.shape[1:]))
             return
         allowed = f"must hold finite numbers, of shape ({self.num_envs}, T, {OBSERVED}), T at least {observations}"
-        try:
-            noise = np.array(given, dtype=np.float64)
-        except (TypeError, ValueError):
-            noise = np.empty(0)
-        shape: tuple[int, ...] = noise.shape
-        fits = len(shape) == 3 and shape[::2] == (self.num_envs, OBSERVED) and shape[1] >= observations
-        refuse_unless(fits, "options['noise']", f"of shape {shape}", allowed)
-        bad = noise[~np.isfinite(noise)]
-        refuse_unless(not len(bad), "an entry of options['noise']", bad[:1].sum(), allowed)
+
+        def fits(shape):
+            return len(shape) == 3 and shape[::2] == (self.num_envs, OBSERVED) and shape[1] >= observations
+
+        noise = given_numbers("noise", given, fits, allowed)
         self._noise[mask, :observations] = noise[mask, :observations]
 
     def _scores(self, n):
@@ -327,18 +322,11 @@ class RocketVectorEnv(BatchedEnv):
 
         Raises BadInput for anything else.
         """
-        widths = [self._scores_drawn, self.draw.shape[1]]
-        shapes = " or ".join(str((self.num_envs, width)) for width in dict.fromkeys(widths))
+        widths = dict.fromkeys([self._scores_drawn, self.draw.shape[1]])
+        shapes = [(self.num_envs, width) for width in widths]
         names = [*draw_names(self.rocket), *(FAILURE_DRAW if self.failure else ())]
-        allowed = f"must hold finite numbers, of shape {shapes}: {', '.join(names)}"
-        try:
-            draw = np.array(given, dtype=np.float64)
-        except (TypeError, ValueError):
-            draw = np.empty(0)
-        fits = draw.shape in [(self.num_envs, width) for width in widths]
-        refuse_unless(fits, "options['draw']", f"of shape {draw.shape}", allowed)
-        bad = draw[~np.isfinite(draw)]
-        refuse_unless(not len(bad), "an entry of options['draw']", bad[:1].sum(), allowed)
+        allowed = f"must hold finite numbers, of shape {' or '.join(map(str, shapes))}: {', '.join(names)}"
+        draw = given_numbers("draw", given, lambda shape: shape in shapes, allowed)
         if not self.failure:
             return draw
         if draw.shape != self.draw.shape:
@@ -465,16 +453,8 @@ class RocketVectorEnv(BatchedEnv):
     def _final_info(self):
         y = self.y.T
         error = terminal_error(y, self.rocket)
-        elements = orbital_elements(y, self.rocket.mu)
         error_norm = np.sqrt((error * error).sum(axis=1))
-        info = {
-            "final_y": y.copy(),
-            "error": error,
-            "error_norm": error_norm,
-            "a_km": elements.a / 1e3,
-            "e": elements.e,
-        }
-        info |= {f"{name}_deg": np.degrees(getattr(elements, name)) for name in ("i", "raan", "argp")}
+        info = {"final_y": y.copy(), "error": error, "error_norm": error_norm, **final_elements(y, self.rocket)}
         info |= {"final_mass_kg": self.y[6].copy(), "final_time_s": self.time.copy(), "crashed": self._crashed.copy()}
         info |= {"max_altitude_km": self._max_altitude / 1e3, "points": precision_points(error_norm)}
         if self.has_draws:
@@ -492,6 +472,18 @@ class RocketVectorEnv(BatchedEnv):
 
         title = "Rocket ascent, nominal stagings marked" if self.has_draws else "Rocket ascent"
         return AscentSheet(self.rocket, title)
+
+
+def given_numbers(name: str, given, fits: Callable, allowed: str) -> np.ndarray:
+    """An option of `reset` in float64. Raises BadInput unless its shape `fits` and all its numbers are finite."""
+    try:
+        numbers = np.array(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        numbers = np.empty(0)
+    refuse_unless(fits(numbers.shape), f"options[{name!r}]", f"of shape {numbers.shape}", allowed)
+    bad = numbers[~np.isfinite(numbers)]
+    refuse_unless(not len(bad), f"an entry of options[{name!r}]", bad[:1].sum(), allowed)
+    return numbers
 
 
 def reachable(rocket: Rocket, dispersion: float, end: float) -> tuple[float, float]:

@@ -15,7 +15,8 @@ import numpy as np
 from common.errors import is_finite, refuse_unless
 from rocket.vehicle import Rocket, engine_groups
 
-FAILURE_TIMES = ("random", "ignition")
+WHEN = {"random": "from a random moment of a burn on", "ignition": "from the last stage's ignition on"}
+FAILURE_TIMES = tuple(WHEN)
 LARGEST_FAILURE = 0.3  # share of thrust
 FAILURE_PROBABILITY = 0.5
 # uniform numbers from 0 to 1; a flight fails if the first is below `FAILURE_PROBABILITY`
@@ -71,7 +72,7 @@ def no_losses(groups, n: int) -> Losses:
     return Losses(np.full((len(groups), n), np.inf), np.zeros((len(groups), n)))
 
 
-def failing_groups(rocket: Rocket, failure_time: str = "random") -> list[int]:
+def failing_groups(rocket: Rocket, failure_time: str) -> list[int]:
     """The groups that may fail, as indices of `engine_groups`: all with thrust, or only the last with "ignition"."""
     with_thrust = [g for g, group in enumerate(engine_groups(rocket)) if group.burns and group.engine.thrust]
     return with_thrust if failure_time == "random" else with_thrust[-1:]

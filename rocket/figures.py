@@ -8,13 +8,12 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Rectangle
-from scipy.stats import binomtest
 
-from drawing.style import BOUNDARY, OPTIMUM, POLICY, TARGET
+from drawing.style import BOUNDARY, OPTIMUM, POLICY, TARGET, TARGET_ORBIT
 from rocket.losses import STANDARD
-from rocket.metrics import BOX, altitude_km, element_misses, final_elements
+from rocket.metrics import BOX, altitude_km, element_misses, wilson
 from rocket.missions import Mission
-from rocket.orbits import local_frame, orbit_vectors, target_axes, target_orbit
+from rocket.orbits import final_elements, local_frame, orbit_vectors, target_axes, target_orbit
 from rocket.vehicle import Rocket
 
 DASHED = {"linewidth": 1.4, "linestyle": (0, (6, 5))}  # the gaps show the other line beneath
@@ -88,16 +87,6 @@ def pitch_and_yaw(u: np.ndarray, y: np.ndarray, rocket: Rocket) -> tuple[np.ndar
     return np.degrees(np.arcsin(np.clip(up, -1, 1))), yaw
 
 
-def target_points(rocket: Rocket) -> np.ndarray:
-    """Points (n, 3) in km, ECI, of the target orbit."""
-    return orbit_points(*target_orbit(rocket.target, rocket.mu), rocket)
-
-
-def reached_points(y: np.ndarray, rocket: Rocket) -> np.ndarray:
-    """Points (n, 3) in km, ECI, of the orbit that a flight y (K+1, 7) ended in."""
-    return orbit_points(*(np.array(vector) for vector in orbit_vectors(y[-1], rocket.mu)), rocket)
-
-
 def orbit_points(h: np.ndarray, e: np.ndarray, rocket: Rocket) -> np.ndarray:
     """Points (n, 3) in km, ECI, of the orbit with this angular momentum and eccentricity vector, (3,) each.
 
@@ -120,17 +109,19 @@ def orbit_figure(mission: Mission, arrays: dict, title: str, highest_km: float) 
     """
     figure = Figure(figsize=(13, 11), layout="constrained")
     panels = figure.subplot_mosaic([["plane", "insertion"], ["ground", "ground"]], height_ratios=[3, 2])
-    reached = reached_points(arrays["y"], mission.rocket)
+    rocket = mission.rocket
+    target = orbit_points(*target_orbit(rocket.target, rocket.mu), rocket)
+    reached = orbit_points(*np.array(orbit_vectors(arrays["y"][-1], rocket.mu)), rocket)
     lines = {
-        "target orbit": (target_points(mission.rocket), {**TARGET, "linewidth": 4.0, "alpha": 0.4}),
+        "target orbit": (target, TARGET_ORBIT),
         "policy": (arrays["y"][:, :3] / 1e3, OURS),
         "orbit reached": (reached, {**OURS, "linewidth": 1.0, "linestyle": ":"}),
         "optimum": (arrays["y_reference"][:, :3] / 1e3, BEST),
     }
-    plot_target_plane(panels["plane"], panels["insertion"], lines, mission.rocket)
+    plot_target_plane(panels["plane"], panels["insertion"], lines, rocket)
     top = 1.15 * max(mission.ceiling_km or 0.0, highest_km)
     panels["insertion"].set(ylim=(-0.03 * top, top))
-    plot_ground_track(panels["ground"], arrays, mission.rocket)
+    plot_ground_track(panels["ground"], arrays, rocket)
     for ax in figure.axes:
         ax.grid(alpha=0.3)
     figure.suptitle(title)
@@ -249,7 +240,7 @@ def losses_figure(report: dict, title: str) -> Figure:
         rows = [(place + aside, report[label][name]) for label, place in places.items()]
         saved = [(x, row["saved"], row["savable"]) for x, row in rows if row["savable"]]
         if saved:
-            bounds = np.array([binomtest(hits, flights).proportion_ci(method="wilson") for _, hits, flights in saved])
+            bounds = np.array([wilson(hits, flights) for _, hits, flights in saved])
             rate = np.array([hits / flights for _, hits, flights in saved])
             share.errorbar([x for x, *_ in saved], 100 * rate, 100 * np.abs(bounds.T - rate), **style)
         pairs = [(x, row["against"]) for x, row in rows if "mass_kg" in row.get("against", {})]

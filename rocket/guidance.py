@@ -26,7 +26,7 @@ import numpy as np
 from common.errors import NoOptimum
 from common.ipopt import interruptible
 from common.workers import Workers
-from rocket.dispersion import draw_vehicles, nominal_vehicles
+from rocket.dispersion import Vehicles, arc_masses, draw_vehicles, nominal_vehicles
 from rocket.dynamics import ascent_dynamics
 from rocket.flight import Fleet, fly_step, steps_at, steps_until, unit_directions
 from rocket.missions import ROCKETS, Mission
@@ -170,7 +170,7 @@ def tracked(mission: Mission, flight: dict) -> Tracked:
     # the last step is cut short, so its own gain is far too large for a whole step
     gains[-1] = gains[-2]
     axes[-1] = axes[-2]
-    ignition = int(np.searchsorted(flight["t"], mission.rocket.last_ignition))
+    ignition = int(np.searchsorted(flight["t"], mission.rocket.ignitions[-1]))
     energy = np.maximum.accumulate(specific_energy(y[ignition:].T, mission.rocket.mu))
     return Tracked(y, u, gains, axes, ignition, energy)
 
@@ -567,16 +567,17 @@ class Replanning:
 DRAWN_SEGMENTS = 40  # collocation intervals; the nominal optimum's mass is within 1e-4 kg of that with 80
 
 
-def drawn_ascent(rocket: Rocket, dispersion: float, z, orbit) -> RemainingAscent:
-    """The whole ascent of the vehicle and air that z (k,) draws, to the orbit (h, e)."""
-    vehicle = draw_vehicles(rocket, dispersion, np.asarray(z)[None])
-    end = np.append(vehicle.end[: len(rocket.burns) - 1, 0], vehicle.burn_out)
-    thrust, flow, dropped = (column[: len(end), 0] for column in (vehicle.thrust, vehicle.flow, vehicle.dropped))
-    lost = flow * np.diff(end, prepend=0.0) + dropped
-    mass = vehicle.mass[0] - np.append(0.0, np.cumsum(lost)[:-1])
+def vehicle_ascent(vehicle: Vehicles, begin: float, state, last_end: float, orbit) -> RemainingAscent:
+    """What is left from `begin` (s) on of one vehicle's ascent to the orbit (h, e).
+
+    Its last burn may go on until `last_end` (s). The vehicle's last arc, which has no thrust, is left out.
+    """
+    end, thrust, flow = (column[:-1, 0] for column in (vehicle.end, vehicle.thrust, vehicle.flow))
+    left = end > begin
+    ends = np.append(end[left][:-1], last_end)
     air = (vehicle.drag[0], vehicle.wind[0, 0], vehicle.wind[1, 0])
     h, e = orbit
-    return RemainingAscent(0.0, rocket.x0[:6], end, thrust, flow, mass, h, e, air)
+    return RemainingAscent(begin, state, ends, thrust[left], flow[left], arc_masses(vehicle)[left], h, e, air)
 
 
 def drawn_intervals(rocket: Rocket, end: float) -> tuple[int, ...]:
@@ -589,9 +590,11 @@ def drawn_intervals(rocket: Rocket, end: float) -> tuple[int, ...]:
 def solve_drawn(job):
     """The optimum of one flight, or None if IPOPT finds none. job is (rocket, dispersion, z, orbit, guess)."""
     rocket, dispersion, z, orbit, guess = job
+    vehicle = draw_vehicles(rocket, dispersion, np.asarray(z)[None])
+    ascent = vehicle_ascent(vehicle, 0.0, rocket.x0[:6], vehicle.burn_out[0], orbit)
     intervals = drawn_intervals(rocket, guess["t"][-1])
     try:
-        return optimise_remaining(rocket, drawn_ascent(rocket, dispersion, z, orbit), guess, intervals)
+        return optimise_remaining(rocket, ascent, guess, intervals)
     except NoOptimum:
         return None
 
@@ -605,7 +608,7 @@ def drawn_optima(env_id: str, dispersion: float, z, reached=None, processes: int
     rocket, guess = ROCKETS[env_id].rocket, optimum_guess(env_id)
     orbits = [target_orbit(rocket.target, rocket.mu)] * len(z)
     if reached is not None:
-        orbits = [tuple(np.array(vector) for vector in orbit_vectors(y, rocket.mu)) for y in reached]
+        orbits = [np.array(orbit_vectors(y, rocket.mu)) for y in reached]
     jobs = [(rocket, dispersion, row, orbit, guess) for row, orbit in zip(z, orbits)]
     with Workers(processes) as workers:
         return workers.map(solve_drawn, jobs)

@@ -156,22 +156,25 @@ def loss_lines(report: dict) -> list[str]:
     lines = ["By the share of thrust lost: of the savable flights, and beside them less " + STANDARD]
     lines.append("  on the flights that both flew, with 95 % intervals (paired, Student's t)")
     for label, laws in report.items():
-        heads = "".join(f"  {head:>{width}}" for head, width in zip(COLUMNS, WIDTHS))
         title = "no failure" if label == "0" else f"{label} lost"
-        lines.append(f"  {title:<22}{heads}")
-        lines += [f"    {name:<20}" + law_cells(law) for name, law in laws.items()]
+        lines.append(aligned(f"{title:<22}", COLUMNS, WIDTHS))
+        lines += [aligned(f"  {name:<20}", law_cells(law), WIDTHS) for name, law in laws.items()]
     return lines
 
 
-def law_cells(law: dict) -> str:
-    """A law's cells in one line."""
+def aligned(name: str, cells, widths) -> str:
+    """A line of a table: the name, then the cells to the right in these widths."""
+    return f"  {name}" + "".join(f"  {cell:>{width}}" for cell, width in zip(cells, widths))
+
+
+def law_cells(law: dict) -> list[str]:
+    """A law's cells."""
     if not law["savable"]:
-        return f"  {0:>{WIDTHS[0]}}"
+        return ["0"]
     short = f"{law['short_mean_kg']:.2f}" if "short_mean_kg" in law else "-"
     cells = [f"{law['savable']}", f"{law['saved_rate']:.1%}", f"{law['error_median']:.6f}", f"{law['error_p95']:.6f}"]
     against = law.get("against", {})
-    cells += [short, interval(against, "saved_rate", 100, ".1f"), interval(against, "mass_kg", 1, ".2f")]
-    return "".join(f"  {cell:>{width}}" for cell, width in zip(cells, WIDTHS))
+    return [*cells, short, interval(against, "saved_rate", 100, ".1f"), interval(against, "mass_kg", 1, ".2f")]
 
 
 def interval(found: dict, name: str, factor: float, form: str) -> str:

@@ -19,7 +19,6 @@ from rocket.environment import RocketVectorEnv
 from rocket.failure import failure_scores
 from rocket.missions import ROCKETS, Mission
 from rocket.navigation import flight_noise
-from rocket.orbits import orbital_elements
 from rocket.vehicle import Rocket
 
 SUCCESS = 0.02  # bound of ||error||, our choice: the paper's "successful orbital insertion" has no bound
@@ -67,10 +66,10 @@ def perigee_longitude(raan: float, argp: float, i: float) -> float:
     return (argp + (raan if i < 90 else -raan)) % 360.0
 
 
-def apsides(a_km: float, e: float, rocket: Rocket) -> dict:
-    """Altitudes of perigee and apogee above Re in km. A hyperbola (a < 0) has an infinite apogee."""
+def apsides(a_km, e, rocket: Rocket) -> dict:
+    """Altitudes of perigee and apogee above Re in km, (n,) or one. A hyperbola (a < 0) has an infinite apogee."""
     Re = rocket.Re / 1e3
-    return {"perigee_km": a_km * (1 - e) - Re, "apogee_km": a_km * (1 + e) - Re if a_km > 0 else np.inf}
+    return {"perigee_km": a_km * (1 - e) - Re, "apogee_km": np.where(a_km > 0, a_km * (1 + e) - Re, np.inf)}
 
 
 def altitude_km(y: np.ndarray, rocket: Rocket) -> np.ndarray:
@@ -241,25 +240,19 @@ def element_misses(flights: dict, rocket: Rocket) -> dict:
     flown = {key: flights[key] for key in ("i_deg", "raan_deg", "argp_deg")}
     if rocket.i in EQUATORIAL:
         flown["argp_deg"] = perigee_longitude(flown["raan_deg"], flown["argp_deg"], rocket.i)
-    a, e, Re = flights["a_km"], flights["e"], rocket.Re / 1e3
-    flown |= {"perigee_km": a * (1 - e) - Re, "apogee_km": a * (1 + e) - Re}
+    flown |= apsides(flights["a_km"], flights["e"], rocket)
     return {key: wrapped(key, flown[key] - target[key]) for key in BOX if key in target}
 
 
 def box_rate(inside: int, n: int) -> dict:
     """The share of n flights inside the launcher's accuracy, and its Wilson interval at 95 % confidence."""
+    low, high = wilson(inside, n)
+    return {"dispersed_box_rate": inside / n, "dispersed_box_low": low, "dispersed_box_high": high}
+
+
+def wilson(hits: int, n: int) -> tuple[float, float]:
+    """The Wilson interval of the share of hits among n, at 95 % confidence."""
     from scipy.stats import binomtest
 
-    interval = binomtest(inside, n).proportion_ci(0.95, method="wilson")
-    return {
-        "dispersed_box_rate": inside / n,
-        "dispersed_box_low": float(interval.low),
-        "dispersed_box_high": float(interval.high),
-    }
-
-
-def final_elements(y: np.ndarray, rocket: Rocket) -> dict:
-    """The elements of states (n, 7) in the names of `final_info`."""
-    elements = orbital_elements(y, rocket.mu)
-    degrees = {f"{name}_deg": np.degrees(getattr(elements, name)) for name in ("i", "raan", "argp")}
-    return {"a_km": elements.a / 1e3, "e": elements.e, **degrees}
+    interval = binomtest(hits, n).proportion_ci(0.95, method="wilson")
+    return float(interval.low), float(interval.high)

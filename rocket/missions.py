@@ -31,15 +31,13 @@ class Mission:
     mass_unit: float | None = None  # kg of propellant that `mass_weight` is the price of (None: 6 % of the dry mass)
 
     def __post_init__(self):
-        for name in ("ceiling_km", "floor_km", "floor_from", "guided_until", "mass_unit"):
+        for name in ("floor_km", "floor_from"):
             value = getattr(self, name)
-            if name in ("floor_km", "floor_from"):
-                possible = is_finite(value)
-                allowed = "must be a finite number"
-            else:
-                possible = value is None or (is_finite(value) and value > 0)
-                allowed = "must be positive and finite, or None"
-            refuse_unless(possible, f"a mission's {name}", value, allowed)
+            refuse_unless(is_finite(value), f"a mission's {name}", value, "must be a finite number")
+        for name in ("ceiling_km", "guided_until", "mass_unit"):
+            value = getattr(self, name)
+            possible = value is None or (is_finite(value) and value > 0)
+            refuse_unless(possible, f"a mission's {name}", value, "must be positive and finite, or None")
 
     @property
     def ceiling(self) -> float:

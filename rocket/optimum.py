@@ -45,14 +45,13 @@ class AscentCase(NamedTuple):
     floor: float = 1.0  # m, lower bound of the altitude
 
 
-PAPER_CEILING = PAPER_MISSION.ceiling  # the paper penalises an overshoot; the bound is ours
 ASCENTS = {
     case.key: case
     for case in (
         AscentCase("free", ROCKET),
         AscentCase("free_table_isp", replace(ROCKET, table_isp=True)),
         AscentCase("fixed", ROCKET, free=False),
-        AscentCase("fixed_capped", ROCKET, free=False, ceiling=PAPER_CEILING),
+        AscentCase("fixed_capped", ROCKET, free=False, ceiling=PAPER_MISSION.ceiling),  # the bound is ours
         AscentCase("drag_free", replace(ROCKET, Cd=0.0), floor=5.0),  # with a lower floor the flight skims the ground
     )
 }
@@ -280,7 +279,7 @@ def ascent_guesses(rocket: Rocket) -> list[tuple[float, float]]:
     An optimum is looked for in the arc that its guess ends in. So each final time is well within the last burn.
     """
     last = rocket.end_time
-    earliest = min((rocket.last_ignition + last) / 2, last)
+    earliest = min((rocket.ignitions[-1] + last) / 2, last)
     end = max(min(900.0, 0.94 * last), earliest)
     return [(end, min(280.0, 0.5 * end)), (end, 0.8 * end), (max(0.8 * end, earliest), 0.4 * end)]
 
@@ -291,8 +290,7 @@ def pitch_times(rocket: Rocket, end: float):
     With four burns they are nine. With fewer burns the longest intervals are halved until there are nine.
     """
     ends = [*(burn.end for burn in rocket.burns[:-1]), end]
-    begins = [0.0, *ends[:-1]]
-    burns = [(begin, stop) for begin, stop, burn in zip(begins, ends, rocket.burns) if not burn.is_coast]
+    burns = [(begin, stop) for begin, stop, burn in zip(rocket.ignitions, ends, rocket.burns) if not burn.is_coast]
     longest = max(burns, key=lambda burn: burn[1] - burn[0])
     times = np.array(sorted({0.0, 30.0, *ends, *np.linspace(*longest, 5)}))
     while len(times) < 9:
@@ -360,7 +358,7 @@ def optimise_ascent(case: AscentCase, segments: int = SEGMENTS) -> dict:
 
 def refuse_early_orbit(case: AscentCase, end: float):
     """Raise NoOptimum if the optimum uses nothing of the last burn, in which the engine is to be cut off."""
-    begins = case.rocket.last_ignition
+    begins = case.rocket.ignitions[-1]
     if case.free and len(case.rocket.burns) > 1 and end < begins + 1e-3:
         todo = "leave that burn out, or give it more payload or a higher orbit"
         raise NoOptimum(

@@ -36,7 +36,7 @@ def orbital_elements(state, mu: float = ROCKET.mu) -> OrbitalElements:
     equatorial orbit is counted from the x axis in the direction of flight. Source: e.g. Vallado, algorithm 9 (RV2COE).
     """
     x = np.moveaxis(np.asarray(state, dtype=np.float64), -1, 0)
-    h, e = (np.array(vector) for vector in orbit_vectors(x, mu))
+    h, e = np.array(orbit_vectors(x, mu))
     energy = specific_energy(x, mu)
     a = np.divide(-mu, 2 * energy, out=np.full(energy.shape, np.inf), where=energy != 0)
     equatorial = (h[0] == 0) & (h[1] == 0)
@@ -51,6 +51,13 @@ def orbital_elements(state, mu: float = ROCKET.mu) -> OrbitalElements:
     raan = np.arctan2(node[1], node[0]) % (2 * np.pi)
     argp = np.where(circular, 0.0, argp % (2 * np.pi))
     return OrbitalElements(a, eccentricity, i, raan, argp)
+
+
+def final_elements(y: np.ndarray, rocket: Rocket) -> dict:
+    """The elements of states (n, 7) in the names of `final_info`."""
+    elements = orbital_elements(y, rocket.mu)
+    degrees = {f"{name}_deg": np.degrees(getattr(elements, name)) for name in ("i", "raan", "argp")}
+    return {"a_km": elements.a / 1e3, "e": elements.e, **degrees}
 
 
 def target_orbit(elements: OrbitalElements = ROCKET.target, mu: float = ROCKET.mu):

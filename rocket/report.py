@@ -9,9 +9,7 @@ import time
 
 import numpy as np
 
-from rocket.dispersion import draw_vehicles
 from rocket.failure import group_names
-from rocket.metrics import draws
 from rocket.missions import ROCKETS
 from rocket.optimum import (
     ASCENTS,
@@ -102,8 +100,8 @@ def report_failures(env_id: str, failing: Failing, starts: int, seed: int) -> tu
     Returns the numbers, and the arrays of `Known` and `about`. Evaluations read the arrays from a file in results/.
     """
     mission = ROCKETS[env_id]
-    z = draws(mission.rocket, failing.dispersion, seed, starts, failing.failure)
-    vehicles = draw_vehicles(mission.rocket, failing.dispersion, z, failing.failure, failing.failure_time)
+    z = failing.draws(mission.rocket, seed, starts)
+    vehicles = failing.vehicles(mission.rocket, z)
     group = vehicles.failure[0]
     began = time.perf_counter()
     known = solve_known(env_id, mission, failing, z)

@@ -20,7 +20,7 @@ from common.errors import NoOptimum
 from common.files import DAMAGED_NPZ
 from common.workers import Workers
 from rocket import guidance
-from rocket.dispersion import DISPERSION, Vehicles, draw_vehicles
+from rocket.dispersion import DISPERSION, Vehicles, arc_masses, draw_vehicles
 from rocket.metrics import draws
 from rocket.missions import Mission
 from rocket.optimum import RESULTS, kept_reference
@@ -40,6 +40,14 @@ class Failing(NamedTuple):
         """The fields among the options of an environment."""
         return cls(**{name: env_options[name] for name in cls._fields if name in env_options})
 
+    def draws(self, rocket: Rocket, eval_seed: int, n: int) -> np.ndarray:
+        """The n draws (n, k) of a seed."""
+        return draws(rocket, self.dispersion, eval_seed, n, self.failure)
+
+    def vehicles(self, rocket: Rocket, z: np.ndarray) -> Vehicles:
+        """The vehicles of draws z (n, k)."""
+        return draw_vehicles(rocket, self.dispersion, z, self.failure, self.failure_time)
+
 
 # ---------------------------------------------------------------------------------------------------------------------
 # One flight
@@ -58,7 +66,7 @@ def solve_rescue(job):
     rocket, failing, z, guess = job
     orbit = target_orbit(rocket.target, rocket.mu)
     healthy = guidance.solve_drawn((rocket, failing.dispersion, z, orbit, guess))
-    vehicle = draw_vehicles(rocket, failing.dispersion, z[None], failing.failure, failing.failure_time)
+    vehicle = failing.vehicles(rocket, z[None])
     group, moment, _ = vehicle.failure[:, 0]
     # no failure, or one after the cut-off, or one in the environment's last step, after which no direction is chosen
     if healthy is None or group < 0 or moment > healthy["final_time"] - rocket.dt:
@@ -115,17 +123,10 @@ def state_at(plan: dict, time: float) -> np.ndarray:
 
 def remaining_after(vehicle: Vehicles, strike: float, state: np.ndarray, orbit) -> guidance.RemainingAscent:
     """What is left of the ascent of one vehicle from its failure on, with a relaxed last burn (`RELAXED_MASS`)."""
-    columns = (vehicle.end, vehicle.thrust, vehicle.flow, vehicle.dropped)
-    end, thrust, flow, dropped = (column[:-1, 0] for column in columns)  # the arc without thrust is left out
-    lost = flow * np.diff(end, prepend=0.0) + dropped
-    mass = vehicle.mass[0] - np.append(0.0, np.cumsum(lost)[:-1])
-    left = end > strike
-    begin = max(strike, end[-2])  # s, when the last arc begins
-    end = end[left]
-    end[-1] = begin + (mass[-1] - RELAXED_MASS * vehicle.dry_mass[0]) / flow[-1]
-    air = (vehicle.drag[0], vehicle.wind[0, 0], vehicle.wind[1, 0])
-    h, e = orbit
-    return guidance.RemainingAscent(strike, state, end, thrust[left], flow[left], mass[left], h, e, air)
+    begin = max(strike, vehicle.end[-3, 0])  # s, when the last arc with thrust begins
+    propellant = arc_masses(vehicle)[-1] - RELAXED_MASS * vehicle.dry_mass[0]
+    last_end = begin + propellant / vehicle.flow[-2, 0]
+    return guidance.vehicle_ascent(vehicle, strike, state, last_end, orbit)
 
 
 def directions_at(optimum: dict, times: np.ndarray) -> np.ndarray:
@@ -169,6 +170,13 @@ class Known(NamedTuple):
         """The same for the first n flights."""
         return Known(*(values[:n] for values in self))
 
+    def note(self, flights, optima: list):
+        """Set the numbers of these flights by their optima. A flight without one keeps its numbers."""
+        for k, optimum in zip(flights, optima):
+            if optimum:
+                self.mass[k] = optimum["final_mass"]
+                self.price[k] = optimum["orbit_price"]
+
     def mass_at(self, error: np.ndarray, rocket: Rocket) -> np.ndarray:
         """The masses (n,) in kg for the orbits with these terminal errors (n, 6), to first order.
 
@@ -181,13 +189,10 @@ class Known(NamedTuple):
 
 def solve_known(env_id: str, mission: Mission, failing: Failing, z: np.ndarray) -> Known:
     """`Known` of draws z (n, k + 4)."""
-    vehicles = draw_vehicles(mission.rocket, failing.dispersion, z, failing.failure, failing.failure_time)
+    vehicles = failing.vehicles(mission.rocket, z)
     has_failed = np.flatnonzero(vehicles.failure[0] >= 0)
     known = Known(np.full(len(z), np.nan), np.full((len(z), 5), np.nan))
-    for k, optimum in zip(has_failed, failing_optima(env_id, mission, failing, z[has_failed])):
-        if optimum:
-            known.mass[k] = optimum["final_mass"]
-            known.price[k] = optimum["orbit_price"]
+    known.note(has_failed, failing_optima(env_id, mission, failing, z[has_failed]))
     return known
 
 
@@ -210,8 +215,7 @@ def known_optima(env_id: str, mission: Mission, failing: Failing, eval_seed: int
     known = stored_optima(about(env_id, mission, failing, eval_seed), n)
     if known is None:
         print(f"{env_id}: solving what can be saved of {n} flights with failures, once", file=sys.stderr, flush=True)
-        z = draws(mission.rocket, failing.dispersion, eval_seed, n, failing.failure)
-        known = solve_known(env_id, mission, failing, z)
+        known = solve_known(env_id, mission, failing, failing.draws(mission.rocket, eval_seed, n))
     for values in known:
         values.flags.writeable = False
     return known

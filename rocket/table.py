@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from rocket.environment import RocketVectorEnv
+from rocket.failure import WHEN
 from rocket.metrics import BOX, ELEMENT_ERRORS, EQUATORIAL, SUCCESS, lowest_key, target_summary, wrapped
 from rocket.missions import Mission
 
@@ -110,8 +111,7 @@ def failure_lines(metrics: dict) -> list[str]:
     """The lines below the rocket's table about flights with a failure. There are none without such flights."""
     if not metrics.get("failure"):
         return []
-    when = {"random": "from a random moment of a burn on", "ignition": "from the last stage's ignition on"}
-    loss = f"up to {metrics['failure']:.0%} of thrust lost {when[metrics['failure_time']]}"
+    loss = f"up to {metrics['failure']:.0%} of thrust lost {WHEN[metrics['failure_time']]}"
     n = metrics["failure_starts"]
     savable = metrics["failure_savable"]
     lines = [f"  {n} flights with a failure, {loss}; {savable} of them can be saved"]

@@ -11,7 +11,6 @@ from common.command_line import integer, number
 from common.errors import refuse_unless
 from common.flying import decision_us
 from rocket.comparison import compare
-from rocket.dispersion import draw_vehicles
 from rocket.environment import flown_mission, fly_rocket
 from rocket.failure import FAILURE_TIMES, LARGEST_FAILURE, NEEDS_CUTOFF
 from rocket.metrics import (
@@ -103,35 +102,27 @@ class RocketTask:
             metrics, arrays = metrics | of_healthy, arrays | ends
             if failure:
                 task = self.flown_with(**env_options)
-                metrics |= task.failures_measured(ends, failing, eval_seed)
-                arrays |= task.saved_flight(policy, ends, failing, eval_seed, **env_options)
+                known = known_optima(self.env_id, task.mission, failing, eval_seed, n)
+                rocket = task.mission.rocket
+                dry_mass = failing.vehicles(rocket, ends["draw"]).dry_mass
+                metrics |= {"failure": float(failure), "failure_time": failure_time}
+                metrics |= failure_metrics(ends, known.mass, known.mass_at(ends["final_error"], rocket), dry_mass)
+                savable = savable_failures(ends, known.mass, dry_mass)
+                arrays |= self.saved_flight(policy, ends, savable, eval_seed, **failing._asdict(), **env_options)
         return metrics, arrays
 
-    def failures_measured(self, arrays: dict, failing: Failing, eval_seed: int) -> dict:
-        """The `failure...` metrics of the flights of a seed."""
-        rocket = self.mission.rocket
-        known = known_optima(self.env_id, self.mission, failing, eval_seed, len(arrays["draw"]))
-        reached = known.mass_at(arrays["final_error"], rocket)
-        dry_mass = draw_vehicles(rocket, failing.dispersion, arrays["draw"]).dry_mass
-        options = {"failure": float(failing.failure), "failure_time": failing.failure_time}
-        return options | failure_metrics(arrays, known.mass, reached, dry_mass)
-
-    def saved_flight(self, policy, arrays: dict, failing: Failing, eval_seed: int, **env_options) -> dict:
-        """Fly again, for the animation, the saved flight with a failure that burns longest.
+    def saved_flight(self, policy, arrays: dict, savable: np.ndarray, eval_seed: int, **env_options) -> dict:
+        """Fly again, for the animation, the saved flight of the `savable` ones (n,) that burns longest.
 
         Returns `t_saved` (K+1,), `u_saved` (K, 3), `y_saved` (K+1, 7) and the flight's number `saved`. Without a saved
         flight it returns {}.
         """
-        known = known_optima(self.env_id, self.mission, failing, eval_seed, len(arrays["draw"]))
-        vehicles = draw_vehicles(self.mission.rocket, failing.dispersion, arrays["draw"])
-        errors = np.linalg.norm(arrays["final_error"], axis=1)
-        saved = savable_failures(arrays, known.mass, vehicles.dry_mass) & (errors < SUCCESS)
+        saved = savable & (np.linalg.norm(arrays["final_error"], axis=1) < SUCCESS)
         if not saved.any():
             return {}
         k = int(np.where(saved, arrays["final_t"], 0.0).argmax())
         noise = partial(flight_noise, eval_seed, [k])
-        options = {**failing._asdict(), **env_options}
-        flight = fly_rocket(self.env_id, policy, draw=arrays["draw"][k], noise=noise, **options)
+        flight = fly_rocket(self.env_id, policy, draw=arrays["draw"][k], noise=noise, **env_options)
         return {f"{key}_saved": flight[key] for key in ("t", "u", "y")} | {"saved": np.array(k)}
 
     def reported_metrics(self, metrics: dict, timed_policy=None, **env_options) -> dict:
@@ -226,11 +217,15 @@ class RocketTask:
         return f"{self.env_id}: ||error|| {metrics['error_norm']:.6f}, {mass}{crash}"
 
     def figures(self, arrays: dict, metrics: dict, curves: list[dict]) -> dict:
+        from drawing.training import Miss, training_figure
         from rocket.figures import ascent_figure, dispersed_figure, orbit_figure
 
-        title, figures = self.headline(metrics), {}
+        title = self.headline(metrics)
+        figures = {}
         if curves:
-            figures["training.png"] = self.training_figure(metrics, curves)
+            label = "$\\Vert$error$\\Vert$ of the mean action"
+            miss = Miss("eval/error_norm", label, success=SUCCESS, by_mean_action=True)
+            figures["training.png"] = training_figure(curves, title, metrics["reference_episodic_return"], miss)
         highest = max(metrics["max_altitude_km"], metrics["reference_max_altitude_km"])
         figures["trajectory.png"] = ascent_figure(self.mission, arrays, title)
         figures["orbit.png"] = orbit_figure(self.mission, arrays, title, highest)
@@ -240,25 +235,15 @@ class RocketTask:
             figures["dispersed.png"] = dispersed_figure(self.mission.rocket, flights_shown(arrays), title)
         return figures
 
-    def training_figure(self, metrics: dict, curves: list[dict]):
-        """The training curves, with ||error|| of the mean action."""
-        from drawing.training import Miss, training_figure
-
-        label = "$\\Vert$error$\\Vert$ of the mean action"
-        miss = Miss("eval/error_norm", label, success=SUCCESS, by_mean_action=True)
-        return training_figure(curves, self.headline(metrics), metrics["reference_episodic_return"], miss)
-
     def animation(self, arrays: dict, metrics: dict):
-        from rocket.animation import ascent_animation, failure_animation
+        from rocket.animation import ascent_animation
 
         if "saved" not in arrays:
             return ascent_animation(self.mission.rocket, arrays, self.headline(metrics))
-        draw = arrays["draw"][arrays["saved"]][None]
-        options = (metrics["failure"], metrics["failure_time"])
-        vehicle = draw_vehicles(self.mission.rocket, metrics.get("dispersion", 0.0), draw, *options)
+        vehicle = Failing.of(metrics).vehicles(self.mission.rocket, arrays["draw"][arrays["saved"]][None])
         error = np.linalg.norm(arrays["final_error"][arrays["saved"]])
         title = f"{self.env_id}: a flight that loses thrust, ||error|| {error:.6f}, and the optimum without a loss"
-        return failure_animation(self.mission.rocket, vehicle, arrays, title)
+        return ascent_animation(self.mission.rocket, arrays, title, vehicle)
 
     # --- files
 

@@ -162,9 +162,9 @@ class Rocket:
         return "Earth" if abs(self.mu / 3.986e14 - 1) < 0.01 else "ground"
 
     @property
-    def last_ignition(self) -> float:
-        """The time in s at which the last burn begins."""
-        return self.burns[-2].end if len(self.burns) > 1 else 0.0
+    def ignitions(self) -> list[float]:
+        """The times in s at which the burns begin."""
+        return [0.0, *(burn.end for burn in self.burns[:-1])]
 
     @property
     def x0(self) -> np.ndarray:
@@ -235,7 +235,7 @@ class Rocket:
     @property
     def last_propellant(self) -> float:
         """The kg of propellant in the last burn's engines when it begins. Each has its own tank."""
-        seconds = self.burns[-1].end - self.last_ignition
+        seconds = self.burns[-1].end - self.ignitions[-1]
         return sum(
             group.number * (group.engine.propellant - group.engine.flow(self.table_isp) * (group.seconds_lit - seconds))
             for group in engine_groups(self)
@@ -282,12 +282,11 @@ def number_of(engine: Engine, parts) -> float:
 
 def propellant_used(rocket: Rocket) -> dict[Engine, float]:
     """The kg of propellant that all engines of each type burn, if none runs dry."""
-    start, used = 0.0, {}
-    for burn in rocket.burns:
+    used = {}
+    for start, burn in zip(rocket.ignitions, rocket.burns):
         for number, engine in burn.engines:
             burnt = number * engine.flow(rocket.table_isp) * (burn.end - start)
             used[engine] = used.get(engine, 0.0) + burnt
-        start = burn.end
     return used
 
 
@@ -322,13 +321,12 @@ class EngineGroup(NamedTuple):
 def engine_groups(rocket: Rocket) -> tuple[EngineGroup, ...]:
     """The groups in the order in which they leave, the last stage's at the end."""
     types, last = engine_types(rocket), len(rocket.burns) - 1
-    ignitions = [0.0, *(burn.end for burn in rocket.burns[:-1])]
     groups = []
     for k, burn in enumerate(rocket.burns):
         leaving = burn.engines if k == last else burn.dropped
         for number, engine in leaving:
             burns = burns_of_group(rocket, engine, k)
-            seconds_lit = sum(rocket.burns[j].end - ignitions[j] for j in burns)
+            seconds_lit = sum(rocket.burns[j].end - rocket.ignitions[j] for j in burns)
             flow = engine.flow(rocket.table_isp)
             seconds_full = engine.propellant / flow if flow else np.inf
             groups.append(EngineGroup(number, engine, types.index(engine), k, burns, seconds_lit, seconds_full))
@@ -393,10 +391,9 @@ def check_burns(rocket: Rocket):
     """
     refuse_unless(isinstance(rocket.burns, tuple), "a rocket's burns", rocket.burns, "must be a tuple")
     refuse_unless(rocket.burns, "a rocket's burns", rocket.burns, "must hold at least one burn")
-    start = 0.0
     for k, burn in enumerate(rocket.burns):
         refuse_unless(isinstance(burn, Burn), f"burns[{k}]", f"{burn!r:.60}", "must be a Burn")
-    for k, burn in enumerate(rocket.burns):
+    for k, (start, burn) in enumerate(zip(rocket.ignitions, rocket.burns)):
         refuse_unless(
             start < burn.end < np.inf, f"burns[{k}].end", burn.end, f"must be finite and later than {start} s"
         )
@@ -413,7 +410,6 @@ def check_burns(rocket: Rocket):
             refuse_unless(0 < number <= has, field, number, allowed)
         for number, _ in burn.dropped:
             refuse_unless(number > 0, f"the number of an engine in burns[{k}].dropped", number, "must be positive")
-        start = burn.end
     last = rocket.burns[-1].dropped
     allowed = "must be empty: the last burn's engines stay aboard"
     refuse_unless(not last, f"burns[{k}].dropped", f"{last!r:.60}", allowed)

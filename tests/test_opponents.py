@@ -279,7 +279,7 @@ def test_to_the_orbit_reached_the_bound_holds():
 def test_recorded_flights_give_the_metrics_again(law):
     policy = guidance.open_loop(CUTOFF) if law == "replay" else lambda obs, t: -obs[:, :3]
     metrics, arrays = evaluate_dispersed(CUTOFF, policy, 4, 12, 6.0)
-    flights = comparison.recorded_flights(arrays, ROCKET, 6.0)
+    flights = comparison.recorded_flights(arrays, ROCKET, comparison.Failing(6.0))
     again = dispersed_metrics(flights, ROCKET)
     assert again.keys() == metrics.keys() - {"dispersion", "dispersed_starts"}
     assert all(again[key] == pytest.approx(metrics[key], rel=1e-12) for key in again)
