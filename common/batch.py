@@ -175,7 +175,7 @@ class BatchedEnv(VectorEnv):
             raise BadInput(f"reset options are {options!r}; {allowed}")
 
     def rows_of(self, options: dict, name: str, width: int, holds: Callable = np.isfinite, allowed: str = "finite"):
-        """An option of a reset as an array (N, width) of finite numbers. Raises BadInput unless `holds` is true of all."""
+        """An option of a reset as an array (N, width) of finite numbers. BadInput unless `holds` is true of all."""
         given = options[name]
         try:
             rows = np.asarray(given, dtype=np.float64)
