@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from drawing.animation import Animation, Flight
 from drawing.style import POLICY
-from drawing.time_plots import TimePlots
+from drawing.time_plots import TimePlots, plot_flight, time_panels
 from drawing.training import cut_outliers, plot_seeds
 
 
@@ -45,23 +45,10 @@ def labels_of(arrays: dict) -> list[str]:
 
 def episodes_figure(arrays: dict, title: str, shown: int) -> Figure:
     """Each observation and each action of the first episodes over time."""
-    labels = labels_of(arrays)
     flights = episodes_of(arrays, shown)
-    columns = min(3, len(labels))
-    rows = -(-len(labels) // columns)
-    figure = Figure(figsize=(4.2 * columns, 2.6 * rows + 0.6), layout="constrained")
-    panels = np.atleast_1d(figure.subplots(rows, columns)).ravel()
-    observations = arrays["obs"].shape[2]
+    figure, panels = time_panels(labels_of(arrays), row_height=2.6, rest=0.6)
     for flight in flights:
-        for k, ax in enumerate(panels[:observations]):
-            ax.plot(flight.t, flight.y[:, k], **POLICY)
-        for k, ax in enumerate(panels[observations : len(labels)]):
-            ax.stairs(flight.u[:, k], flight.t, baseline=None, **POLICY)
-    for ax, label in zip(panels, labels):
-        ax.set(xlabel="time (s)", ylabel=label)
-        ax.grid(alpha=0.3)
-    for ax in panels[len(labels) :]:
-        ax.set_axis_off()
+        plot_flight(panels, flight, POLICY)
     figure.suptitle(f"{title}\nthe first {len(flights)} episodes")
     return figure
 

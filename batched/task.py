@@ -11,7 +11,6 @@ from common.errors import BadInput
 from common.flying import fly_until_ended
 from common.tasks import SampledTask
 
-KEPT_FLIGHTS = 30  # in a results folder
 SHOWN_FLIGHTS = 10  # in a figure
 
 
@@ -100,14 +99,7 @@ class BatchedTask(SampledTask):
     def required_arrays(self, metrics: dict) -> set[str]:
         return {"t", "obs", "u", "reward"}
 
-    def kept_arrays(self, arrays: dict) -> dict:
-        """Of the first `KEPT_FLIGHTS`; all arrays but the times are by episode."""
-        return {key: array if key == "t" else array[:KEPT_FLIGHTS] for key, array in arrays.items()}
-
     # --- commands
-
-    def speed_cases(self) -> list[tuple[str, dict, list | None]]:
-        return [("", {}, None)]
 
     def add_arguments(self, parser) -> None:
         """No flags: there is nothing to solve."""

@@ -156,11 +156,34 @@ class BatchedEnv(VectorEnv):
         """Start every environment anew. Returns (N, obs) float64 and an empty info."""
         super().reset(seed=seed)
         options = dict(options or {})
+        before = vars(self.training)
         self.hand_over(options.pop("training", {}))
-        self._restart(np.ones(self.num_envs, dtype=bool), options)
+        try:
+            self._restart(np.ones(self.num_envs, dtype=bool), options)
+        except BadInput:
+            self.hand_over(before)
+            raise
         self._waiting[:] = False
         self._was_reset = True
         return self._observe(), {}
+
+    def refuse_options(self, options: dict, known: list[str]):
+        """Raise BadInput if a reset has an option that is not among these."""
+        if options.keys() - set(known):
+            names = " and ".join(map(repr, known))
+            allowed = f"they may be {names}" if len(known) > 1 else f"the only one is {names}"
+            raise BadInput(f"reset options are {options!r}; {allowed}")
+
+    def rows_of(self, options: dict, name: str, width: int, holds: Callable = np.isfinite, allowed: str = "finite"):
+        """An option of a reset as an array (N, width) of finite numbers. BadInput unless `holds` is true of all."""
+        given = options[name]
+        try:
+            rows = np.asarray(given, dtype=np.float64)
+        except (TypeError, ValueError):
+            rows = np.empty(0)
+        if rows.shape != (self.num_envs, width) or not (np.isfinite(rows) & holds(rows)).all():
+            raise BadInput(f"options[{name!r}] must be {allowed}, of shape ({self.num_envs}, {width}); got {given!r}")
+        return rows
 
     def setting(self, name: str):
         """What the training hands over by this name, or else this environment's attribute of the same name."""
@@ -303,9 +326,7 @@ class SingleEnv(gym.Env):
         """Start anew. Returns the observation and an empty info. `options` are the batch's without their first axis."""
         super().reset(seed=seed)
         self._running = False  # stays so if the options are refused
-        if options and "x0" in options:
-            options = {**options, "x0": np.asarray(options["x0"])[None]}
-        for name in ("draw", "noise"):
+        for name in ("x0", "draw", "noise"):
             if options and name in options:
                 options = {**options, name: [options[name]]}
         obs, info = self.batch.reset(seed=seed, options=options)

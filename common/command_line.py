@@ -29,14 +29,19 @@ def integer(low: int, high: int) -> Callable:
     return parse
 
 
+def number_in(text: str) -> float:
+    """The number that a text is. NaN, which is in no range, if it is none."""
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
 def number(low: float, high: float) -> Callable:
     """Argument type: a number from `low` to `high`."""
 
     def parse(text):
-        try:
-            value = float(text)
-        except ValueError:
-            value = math.nan
+        value = number_in(text)
         if not low <= value <= high:
             raise argparse.ArgumentTypeError(f"{text!r} must be a number from {low} to {high}")
         return value
@@ -46,10 +51,7 @@ def number(low: float, high: float) -> Callable:
 
 def positive(text: str) -> float:
     """Argument type: a dispersion above 0, at most 10."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
+    value = number_in(text)
     if not 0 < value <= 10:
         raise argparse.ArgumentTypeError(f"{text!r} must be a number above 0, at most 10")
     return value
@@ -85,10 +87,7 @@ def utc(text: str) -> datetime:
 
 def longitude(text: str) -> float:
     """Argument type: degrees east."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
+    value = number_in(text)
     if not -180 <= value <= 360:
         raise argparse.ArgumentTypeError(f"{text!r} must be degrees east, from -180 to 360")
     return value

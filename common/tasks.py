@@ -132,9 +132,10 @@ class Task(Protocol):
 
 
 class SampledTask:
-    """The base of tasks in which every seed samples new flights, and all flights take the same time to evaluate."""
+    """The base of tasks in which every seed samples new flights. It has the answers that several families give."""
 
     env_id: str
+    kept_flights = 30  # in a results folder
 
     def reported_metrics(self, metrics: dict, timed_policy: Callable | None = None, **env_options) -> dict:
         return {}
@@ -147,6 +148,17 @@ class SampledTask:
 
     def remark_on_seed(self, eval_seed: int) -> str | None:
         return f"--eval-seed {eval_seed} is the training's --seed: it may have flown these starts"
+
+    def refusal(self, trains: bool, **env_options) -> tuple[str, str] | None:
+        return None
+
+    def kept_arrays(self, arrays: dict) -> dict:
+        """The arrays of the first flights. Only `t` and `decision_s` are the same for all."""
+        shared = ("t", "decision_s")
+        return {key: array if key in shared else array[: self.kept_flights] for key, array in arrays.items()}
+
+    def speed_cases(self) -> list[tuple[str, dict, list | None]]:
+        return [("", {}, None)]
 
     def fly_opponents(self, folder: Path, **options) -> None:
         raise BadInput(f"the env_id of {folder} is {self.env_id}; it must be a rocket's with cut-off or a lander's")

@@ -6,13 +6,14 @@ with flights on it. Pillow, which Matplotlib needs anyway, writes the GIF, so ne
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from PIL import Image
 
 from common.errors import BadInput
@@ -21,10 +22,8 @@ from common.files import replacing
 WIDTH, HEIGHT, DPI = 800, 450, 100  # pixels of a frame, and pixels of an inch, because text and lines are in points
 SIDES = {"": "policy", "_reference": "optimum"}  # by the suffix of their arrays in eval.npz
 # a flight's head: a dot for the policy, a ring around it for the optimum
-DOT, LOOKS = (
-    {"linestyle": "", "marker": "o", "zorder": 6},
-    ({"markersize": 4.5}, {"markersize": 7, "fillstyle": "none"}),
-)
+DOT = {"linestyle": "", "marker": "o", "zorder": 6}
+LOOKS = {"markersize": 4.5}, {"markersize": 7, "fillstyle": "none"}
 GROWTH = 1.25  # axes grow by this factor, so that those of a running environment do not creep
 
 
@@ -75,6 +74,11 @@ class Sheet:
         ax.grid(alpha=0.3)
         return ax
 
+    def add_lines(self, ax, style: dict) -> LineCollection:
+        """Add the lines of any number of flights to a panel."""
+        look = {"colors": style["color"], "linewidths": style["linewidth"] * 0.8, "linestyles": [style["linestyle"]]}
+        return ax.add_collection(LineCollection([], zorder=4, **look), autolim=False)
+
     def fit(self, flights: list[Flight]):
         """Set axes that hold all these flights."""
         raise NotImplementedError
@@ -109,6 +113,11 @@ class Sheet:
         for artist in sorted(self.moving, key=lambda artist: artist.zorder):
             self.figure.draw_artist(artist)
         return np.asarray(self.canvas.buffer_rgba())[..., :3].copy()
+
+
+def handles_of(styles: list[dict]) -> list[Line2D]:
+    """The legend's handles of the policy's style, and of the optimum's if there is one."""
+    return [Line2D([], [], **style, label=name) for style, name in zip(styles, SIDES.values())]
 
 
 def room(base: float, values: np.ndarray) -> float:
@@ -158,12 +167,7 @@ def write_gif(file, frame, count: int):
     """Write `count` frames as a GIF that plays for ever. `frame(k)` gives a frame, uint8 (H, W, 3)."""
     samples = np.vstack([frame(0), frame(count // 2), frame(count - 1)])
     palette = Image.fromarray(samples).quantize(COLOURS, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
-    first, *others = indexed(frame, count, palette)
+    images = [Image.fromarray(frame(k)) for k in range(count)]
+    first, *others = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     durations = [FRAME_MS] * (count - 1) + [HOLD_MS]
     first.save(file, format="GIF", save_all=True, append_images=others, duration=durations, loop=0, disposal=1)
-
-
-def indexed(frame, count: int, palette: Image.Image) -> Iterator[Image.Image]:
-    """The frames in the palette's colours, without dither, one after the other."""
-    for k in range(count):
-        yield Image.fromarray(frame(k)).quantize(palette=palette, dither=Image.Dither.NONE)

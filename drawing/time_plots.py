@@ -1,13 +1,40 @@
-"""A sheet with a panel for each state and each control, over time."""
+"""A panel for each state and each control over time: figures, and the sheet of an animation."""
 
 from __future__ import annotations
 
 import numpy as np
-from matplotlib.collections import LineCollection
-from matplotlib.lines import Line2D
+from matplotlib.figure import Figure
 
-from drawing.animation import SIDES, Flight, Sheet
+from drawing.animation import Flight, Sheet, handles_of
 from drawing.style import OPTIMUM, POLICY
+
+
+def grid_of(labels: list[str]) -> tuple[int, int]:
+    """The rows and columns of panels with these labels."""
+    columns = min(3, len(labels))
+    return -(-len(labels) // columns), columns
+
+
+def time_panels(labels: list[str], row_height: float, rest: float) -> tuple[Figure, np.ndarray]:
+    """A figure with a panel for each label, and its panels. `row_height` and `rest` are the figure's, in inches."""
+    rows, columns = grid_of(labels)
+    figure = Figure(figsize=(4.2 * columns, row_height * rows + rest), layout="constrained")
+    panels = np.atleast_1d(figure.subplots(rows, columns)).ravel()
+    for ax, label in zip(panels, labels):
+        ax.set(xlabel="time (s)", ylabel=label)
+        ax.grid(alpha=0.3)
+    for ax in panels[len(labels) :]:
+        ax.set_axis_off()
+    return figure, panels
+
+
+def plot_flight(panels, flight: Flight, style: dict):
+    """Plot a flight's states in the first panels, and its controls in the next ones."""
+    states = flight.y.shape[1]
+    for ax, state in zip(panels, flight.y.T):
+        ax.plot(flight.t, state, **style)
+    for ax, control in zip(panels[states:], flight.u.T):
+        ax.stairs(control, flight.t, baseline=None, **style)  # a control is held over each step
 
 
 class TimePlots(Sheet):
@@ -17,24 +44,19 @@ class TimePlots(Sheet):
         super().__init__(title)
         self.states = states
         self.styles = [POLICY, OPTIMUM] if compared else [POLICY]
-        columns = min(3, len(labels))
-        rows = -(-len(labels) // columns)
+        rows, columns = grid_of(labels)
         width, height = 0.96 / columns, 0.84 / rows
         self.panels = []
         for k, label in enumerate(labels):
             row, column = divmod(k, columns)
             box = (0.06 + column * width, 0.94 - (row + 1) * height + 0.06, width - 0.075, height - 0.09)
             self.panels.append(self.panel(box, ylabel=label, xlim=(0, horizon)))
-        handles = [Line2D([], [], **style, label=name) for style, name in zip(self.styles, SIDES.values())]
+        handles = handles_of(self.styles)
         handles += mark(self.panels) if mark else []
-        self.lines = [[self._lines(ax, style) for ax in self.panels] for style in self.styles]
+        self.lines = [[self.add_lines(ax, style) for ax in self.panels] for style in self.styles]
         self.figure.legend(handles=handles, loc="lower center", ncols=len(handles), fontsize=8, frameon=False)
         self.clock = self.figure.text(0.01, 0.02, "", fontsize=9, weight="bold")
         self.moving = [*sum(self.lines, []), self.clock]
-
-    def _lines(self, ax, style: dict) -> LineCollection:
-        look = {"colors": style["color"], "linewidths": style["linewidth"] * 0.8, "linestyles": [style["linestyle"]]}
-        return ax.add_collection(LineCollection([], zorder=4, **look), autolim=False)
 
     def fit(self, flights: list[Flight]):
         """Set axes that hold all these flights. They never shrink, so that those of a running flight do not jump."""

@@ -13,7 +13,7 @@ from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
 
 from common.batch import RENDERED, BatchedEnv, SingleEnv, Training, check_options, checked, numeric, refuse_autoreset
-from common.errors import BadInput, is_finite, refuse_unless
+from common.errors import is_finite, refuse_unless
 from common.flying import fly_until_ended
 from landing.dynamics import Arc
 from landing.lander import DRAW, LANDERS, Flights, Lander, check_failure, draw_flights
@@ -174,17 +174,16 @@ class LanderVectorEnv(BatchedEnv):
         return Box(np.array(low), np.array(high), dtype=np.float64)
 
     def _start(self, mask, options):
-        if options.keys() - {"x0", "draw"}:
-            raise BadInput(f"reset options are {options!r}; they may be 'x0' and 'draw'")
+        self.refuse_options(options, ["x0", "draw"])
         count = int(mask.sum())
         draw = self._draw_starts(lambda n: self.np_random.random((n, len(DRAW))), count)
         if "draw" in options:
             in_unit = lambda z: (z >= 0) & (z <= 1)  # noqa: E731
-            draw = self._checked("draw", options["draw"], len(DRAW), "from 0 to 1", in_unit)[mask]
+            draw = self.rows_of(options, "draw", len(DRAW), in_unit, "from 0 to 1")[mask]
         new = self._drawn(draw)
         if "x0" in options:
-            above_ground = lambda x: (x[:, 2:3] > 0) & (x == x)  # noqa: E731
-            x0 = self._checked("x0", options["x0"], 6, "finite, and above the ground (z > 0)", above_ground)[mask]
+            above_ground = lambda x: x[:, 2:3] > 0  # noqa: E731
+            x0 = self.rows_of(options, "x0", 6, above_ground, "finite, and above the ground (z > 0)")[mask]
             new = new._replace(r=x0[:, :3].T, v=x0[:, 3:].T)
         for column, drawn in zip(self.flights, new):
             column[..., mask] = drawn
@@ -199,16 +198,6 @@ class LanderVectorEnv(BatchedEnv):
         self._ticks[mask] = 0
         self.down[mask] = False
         self._ended[mask] = False
-
-    def _checked(self, name, given, width, allowed, holds):
-        """An option of `reset` as an array (N, width), of which `holds` is true. Raises BadInput for anything else."""
-        try:
-            rows = np.asarray(given, dtype=np.float64)
-        except (TypeError, ValueError):
-            rows = np.empty(0)
-        if rows.shape != (self.num_envs, width) or not (np.isfinite(rows) & holds(rows)).all():
-            raise BadInput(f"options[{name!r}] must be {allowed}, of shape ({self.num_envs}, {width}); got {given!r}")
-        return rows
 
     def effectiveness(self) -> np.ndarray:
         """The factors (3, N) on the thrust along each axis in this period."""

@@ -66,10 +66,10 @@ def flown_thrust(y: np.ndarray, gravity: np.ndarray, period: float) -> np.ndarra
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def descent_figure(arrays: dict, title: str, lander: Lander | None = None) -> Figure:
+def descent_figure(arrays: dict, title: str, lander: Lander) -> Figure:
     """Altitude over downrange and crossrange (m) of the first flights; thrust (kN) over time (s) of three of them.
 
-    Only these three are shown with their optima. A `lander` adds the limits of its thrust.
+    Only these three are shown with their optima. Dotted lines are the limits of the lander's thrust.
     """
     figure = Figure(figsize=(13, 9.5), layout="constrained")
     paths, thrusts = figure.subfigures(2, 1, height_ratios=[3, 2])
@@ -85,11 +85,11 @@ def descent_figure(arrays: dict, title: str, lander: Lander | None = None) -> Fi
         ax.grid(alpha=0.3)
     count = len(arrays["y"][:PATHS])
     figure.suptitle(f"{title}\npaths of the first {count} flights" if count > 1 else title)
-    add_legend(figure, arrays, chosen, lander)
+    add_legend(figure, arrays, chosen)
     return figure
 
 
-def add_legend(figure: Figure, arrays: dict, chosen: list[int], lander: Lander | None):
+def add_legend(figure: Figure, arrays: dict, chosen: list[int]):
     """One legend for all panels, of what is there."""
     effectiveness = arrays["effectiveness"]
     handles = [
@@ -100,8 +100,7 @@ def add_legend(figure: Figure, arrays: dict, chosen: list[int], lander: Lander |
     handles.append(Line2D([], [], color=TARGET["color"], marker="^", markersize=9, linestyle="", label="pad"))
     if any(strike_time(effectiveness[row], 1.0) for row in chosen):  # later than at the start
         handles.append(Line2D([], [], **STRIKE, label="the failure strikes"))
-    if lander:
-        handles.append(Line2D([], [], **BOUNDARY, label="limits of the thrust"))
+    handles.append(Line2D([], [], **BOUNDARY, label="limits of the thrust"))
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
 
 
@@ -130,7 +129,7 @@ def plot_paths(ax, arrays: dict, axis: int, chosen: list[int]):
         ax.set_xlim(-100, 100)
 
 
-def plot_thrust(ax, arrays: dict, row: int, lander: Lander | None):
+def plot_thrust(ax, arrays: dict, row: int, lander: Lander):
     """The thrust that acted in one flight and in its optimum."""
     period = float(arrays["decision_s"])
     gravity = arrays["gravity"][row]
@@ -143,9 +142,8 @@ def plot_thrust(ax, arrays: dict, row: int, lander: Lander | None):
             thrust = flown_thrust(y, gravity, period)
             size = np.linalg.norm(thrust, axis=1) / 1e3
             ax.stairs(size, period * np.arange(len(size) + 1), baseline=None, **style)
-    if lander:
-        for limit in (lander.least_thrust, lander.greatest_thrust):
-            ax.axhline(limit / 1e3, **BOUNDARY)
+    for limit in (lander.least_thrust, lander.greatest_thrust):
+        ax.axhline(limit / 1e3, **BOUNDARY)
     if strike:
         ax.axvline(strike, **STRIKE)
     ax.set_title(f"flight {row + 1}: {words_of(strike)}")

@@ -23,7 +23,7 @@ from common.errors import NoOptimum
 from common.workers import Workers
 from landing.environment import PERIOD
 from landing.lander import Lander
-from landing.optimum import Descent, LandingMesh, Trajectory, energy_optimal_time, solve_from_guess, straight_line
+from landing.optimum import Descent, LandingMesh, Trajectory, energy_optimal_time, solve_from_guess, straight_lines
 
 LAWS = {  # what each law has to know
     "drdv": "true gravity; nominal mass",
@@ -181,7 +181,9 @@ class PlanJob(NamedTuple):
 def plan_one(job: PlanJob) -> tuple[Trajectory | None, float]:
     """The plan of one flight, or None if IPOPT finds none, and the seconds that it took on one core."""
     begin = time.process_time()
-    guesses = first_guesses(job) if job.guess is None else [job.guess]
+    guesses = [job.guess]
+    if job.guess is None:
+        guesses = straight_lines(job.lander, job.descent, DURATIONS, PLAN_INTERVALS)
     plan = None
     for guess in guesses:
         mesh = LandingMesh.stretched(PLAN_INTERVALS, guess.seconds)
@@ -191,14 +193,6 @@ def plan_one(job: PlanJob) -> tuple[Trajectory | None, float]:
         except NoOptimum:
             continue
     return plan, time.process_time() - begin
-
-
-def first_guesses(job: PlanJob) -> list[Trajectory]:
-    """The guesses from which IPOPT begins without a last plan."""
-    r = job.descent.state[None, :3]
-    v = job.descent.state[None, 3:6]
-    energy_optimal = float(energy_optimal_time(r, v, job.lander.gravity)[0])
-    return [straight_line(job.lander, job.descent, share * energy_optimal, PLAN_INTERVALS) for share in DURATIONS]
 
 
 class Replanned:

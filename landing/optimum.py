@@ -12,13 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from common.batch import check_options
 from common.errors import NoOptimum
 from common.ipopt import SolveClock, interruptible, limit
 from common.workers import Workers
 from landing.dynamics import TINY, burn
-from landing.environment import PERIOD, LanderVectorEnv, state_of
-from landing.lander import DRAW, LANDERS, Flights, Lander, check_failure, draw_flights
+from landing.environment import PERIOD, LanderVectorEnv, make_lander_vector, state_of
+from landing.lander import DRAW, Flights, Lander, draw_flights
 
 # ---------------------------------------------------------------------------------------------------------------------
 # A flight as it is solved
@@ -256,6 +255,14 @@ def straight_line(lander: Lander, descent: Descent, seconds: float, count: int) 
     return Trajectory(seconds * share, np.tile(thrust * (possible / norm), (count, 1)), y)
 
 
+def straight_lines(lander: Lander, descent: Descent, shares: tuple[float, ...], count: int) -> list[Trajectory]:
+    """The guesses that take these shares of the energy-optimal time, in `count` intervals each."""
+    r = descent.state[None, :3]
+    v = descent.state[None, 3:6]
+    seconds = float(energy_optimal_time(r, v, lander.gravity)[0])
+    return [straight_line(lander, descent, share * seconds, count) for share in shares]
+
+
 @interruptible()
 def solve_from_guess(
     lander: Lander,
@@ -310,13 +317,10 @@ def stretched_optimum(lander: Lander, descent: Descent, glide_slope: float | Non
     If the lander is down before the failure strikes, the failure does not matter. Otherwise the strike cuts the flight
     into two arcs. Raises NoOptimum if no guess leads to one.
     """
-    r, v = descent.state[None, :3], descent.state[None, 3:6]
-    energy_optimal = float(energy_optimal_time(r, v, lander.gravity)[0])
     is_healthy = descent.strike > 0
     known = descent._replace(strike=np.inf if is_healthy else 0.0)
     failure = NoOptimum("landing: no time to solve it")
-    for share in DURATIONS:
-        line = straight_line(lander, descent, share * energy_optimal, INTERVALS)
+    for line in straight_lines(lander, descent, DURATIONS, INTERVALS):
         try:
             path = solve_from_guess(lander, known, line, LandingMesh.stretched(INTERVALS, line.seconds), glide_slope)
             if is_healthy and descent.strike < path.seconds:
@@ -424,18 +428,10 @@ def references(env_id: str, draw: np.ndarray, processes: int = 1, **env_options)
     `solved` is False. Recent answers are remembered, in read-only arrays. `processes` share the solves, which changes
     only the time. Raises NoOptimum if no draw has an optimum.
     """
-    check_options(LanderVectorEnv, env_options)
-    lander = LANDERS[env_id]
-    probability = env_options.get("failure_probability")
-    size = env_options.get("failure_size")
-    failure = (
-        lander.failure_probability if probability is None else probability,
-        lander.failure_size if size is None else size,
-        env_options.get("failure_time", "start"),
-    )
-    check_failure(*failure)
+    batch = make_lander_vector(env_id, **env_options)
+    failure = batch.failure_probability, batch.failure_size, batch.failure_time
     rows = np.ascontiguousarray(draw, dtype=np.float64).tobytes()
-    return dict(kept_references(lander, rows, failure, processes))
+    return dict(kept_references(batch.lander, rows, failure, processes))
 
 
 @lru_cache(maxsize=8)
@@ -447,7 +443,8 @@ def kept_references(lander: Lander, rows: bytes, failure: tuple, processes: int)
     jobs = [(lander, Flights(*(array[..., [k]] for array in drawn)), 0) for k in first]
     if len(jobs) > 1:
         print(f"solving the optima of {len(jobs)} landings, once", file=sys.stderr, flush=True)
-    found = solutions(jobs, processes)
+    with Workers(processes) as workers:
+        found = workers.map(solve_job, jobs)
     optima = [found[k] for k in of_draw.ravel()]
     solved = [optimum for optimum in optima if isinstance(optimum, dict)]
     if not solved:
@@ -468,12 +465,6 @@ def kept_references(lander: Lander, rows: bytes, failure: tuple, processes: int)
     for array in arrays.values():
         array.flags.writeable = False
     return arrays
-
-
-def solutions(jobs: list, processes: int) -> list:
-    """What `solve_job` returns for each job, in the jobs' order."""
-    with Workers(processes) as workers:
-        return workers.map(solve_job, jobs)
 
 
 def solve_job(job) -> dict | NoOptimum:

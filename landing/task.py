@@ -8,6 +8,7 @@ import numpy as np
 
 from common.command_line import integer
 from common.errors import refuse_unless
+from common.tasks import SampledTask
 from landing.comparison import compare
 from landing.environment import fly_lander
 from landing.lander import LANDERS, Lander
@@ -22,11 +23,12 @@ SOLVED = 20  # draws whose optima `baselines.py` solves unless --starts says oth
 
 
 @dataclass(frozen=True)
-class LanderTask:
+class LanderTask(SampledTask):
     """A lander in `LANDERS`: every flight has its own draw."""
 
     env_id: str
     lander: Lander
+    kept_flights = KEPT_FLIGHTS
 
     @classmethod
     def of(cls, env_id: str) -> LanderTask:
@@ -51,9 +53,6 @@ class LanderTask:
             reference = self.optimum(eval_seed, n, **env_options)
         return evaluate_policy(self.env_id, policy, reference, eval_seed, n, **env_options)
 
-    def reported_metrics(self, metrics: dict, timed_policy=None, **env_options) -> dict:
-        return {}
-
     # --- the size of an evaluation, and what a run may not do
 
     def default_flights(self, is_brief: bool, **env_options) -> int:
@@ -64,9 +63,6 @@ class LanderTask:
 
     def remark_on_seed(self, eval_seed: int) -> str | None:
         return None  # draws of an evaluation come from another stream
-
-    def refusal(self, trains: bool, **env_options) -> tuple[str, str] | None:
-        return None
 
     # --- words and pictures
 
@@ -93,22 +89,18 @@ class LanderTask:
         return f"{self.env_id}: {landed}, propellant {metrics['fuel_ratio']:.3f} x optimum"
 
     def figures(self, arrays: dict, metrics: dict, curves: list[dict]) -> dict:
+        from drawing.training import Miss, training_figure
         from landing.figures import descent_figure, propellant_figure, touchdown_figure
 
-        title, figures = self.headline(metrics), {}
+        title = self.headline(metrics)
+        figures = {}
         if curves:
-            figures["training.png"] = self.training_figure(metrics, curves)
+            miss = Miss("eval/position_error_mean_m", "position error (m), mean action")
+            figures["training.png"] = training_figure(curves, title, metrics["reference_episodic_return"], miss)
         figures["descent.png"] = descent_figure(arrays, title, self.lander)
         figures["touchdown.png"] = touchdown_figure(arrays, title)
         figures["propellant.png"] = propellant_figure(arrays, title)
         return figures
-
-    def training_figure(self, metrics: dict, curves: list[dict]):
-        """The training curves, with the position error of the mean action."""
-        from drawing.training import Miss, training_figure
-
-        miss = Miss("eval/position_error_mean_m", "position error (m), mean action")
-        return training_figure(curves, self.headline(metrics), metrics["reference_episodic_return"], miss)
 
     def animation(self, arrays: dict, metrics: dict):
         from landing.animation import descent_animation
@@ -120,10 +112,6 @@ class LanderTask:
     def required_arrays(self, metrics: dict) -> set[str]:
         of_flights = {"u", "decision_s", "start", "gravity", "effectiveness", "final_y", "final_t", "y", "fuel_kg"}
         return of_flights | {"y_reference", "fuel_kg_reference"}
-
-    def kept_arrays(self, arrays: dict) -> dict:
-        """The arrays of the first `KEPT_FLIGHTS` flights. All arrays but the period are by flight."""
-        return {key: array if key == "decision_s" else array[:KEPT_FLIGHTS] for key, array in arrays.items()}
 
     # --- commands
 

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from matplotlib.collections import LineCollection
 from matplotlib.lines import Line2D
 
-from drawing.animation import DOT, HEIGHT, LOOKS, SIDES, WIDTH, Animation, Flight, Sheet, room
+from drawing.animation import DOT, HEIGHT, LOOKS, SIDES, WIDTH, Animation, Flight, Sheet, handles_of, room
 from drawing.style import BOUNDARY, OPTIMUM, POLICY, TARGET
 from drawing.time_plots import TimePlots, stairs
 from phased.figures import add_circle, flights_of, mark_table
@@ -29,9 +28,8 @@ class PhasePlane(Sheet):
         for side in problem.u_box[:, 0]:
             self.control.axhline(side, **{**BOUNDARY, "linestyle": "--"})
         self._mark_phases()
-        self.lines = [
-            [self._lines(ax, style) for ax in (self.plane, self.position, self.control)] for style in self.styles
-        ]
+        panels = self.plane, self.position, self.control
+        self.lines = [[self.add_lines(ax, style) for ax in panels] for style in self.styles]
         looks = zip(self.styles, LOOKS)
         self.heads = [self.plane.plot([], [], color=style["color"], **DOT, **look)[0] for style, look in looks]
         self.starts = self.plane.plot([], [], "k.", markersize=4)[0]
@@ -39,10 +37,6 @@ class PhasePlane(Sheet):
         self.clock = self.plane.text(0.02, 0.98, "", **style)
         self._add_legend()
         self.moving = [*sum(self.lines, []), *self.heads, *self.circles, self.starts, self.clock]
-
-    def _lines(self, ax, style: dict) -> LineCollection:
-        look = {"colors": style["color"], "linewidths": style["linewidth"] * 0.8, "linestyles": [style["linestyle"]]}
-        return ax.add_collection(LineCollection([], zorder=4, **look), autolim=False)
 
     def _mark_phases(self):
         """Draw in green each phase's circle, and its target over the phase's time."""
@@ -64,7 +58,7 @@ class PhasePlane(Sheet):
             start = end
 
     def _add_legend(self):
-        handles = [Line2D([], [], **style, label=name) for style, name in zip(self.styles, SIDES.values())]
+        handles = handles_of(self.styles)
         label = "targets" if self.problem.waypoints else "target"
         handles.append(Line2D([], [], **TARGET, linestyle="", marker="o", fillstyle="none", label=label))
         handles.append(Line2D([], [], color="k", marker=".", linestyle="", label="start"))

@@ -12,7 +12,7 @@ from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
 
 from common.batch import RENDERED, BatchedEnv, SingleEnv, Training, check_options, checked, numeric, refuse_autoreset
-from common.errors import BadInput, refuse_unless
+from common.errors import refuse_unless
 from common.flying import fly_until_ended
 from common.integration import falling_root
 from phased.problem import LARGEST_SCORE, PROBLEMS, Phase, Problem
@@ -175,15 +175,15 @@ class PhasedVectorEnv(BatchedEnv):
         self._alike = len({(phase.f, phase.running) for phase in phases}) == 1  # all phases have the same dynamics
 
     def _start(self, mask, options):
-        self._refuse_options(options)
         problem, count = self.problem, int(mask.sum())
+        self.refuse_options(options, ["x0", "draw"] if problem.scores else ["x0"])
         draw = self.draw[mask]
         if problem.scores:
             draw = self._draw_starts(lambda n: problem.draw_scores(self.np_random, n), count)
         if "draw" in options:
-            draw = self._checked("draw", options["draw"], problem.scores)[mask]
+            draw = self.rows_of(options, "draw", problem.scores)[mask]
         if "x0" in options:
-            x0 = self._checked("x0", options["x0"], problem.states)[mask]
+            x0 = self.rows_of(options, "x0", problem.states)[mask]
         elif callable(problem.x0):
             x0 = np.column_stack([np.broadcast_to(x, count) for x in problem.x0(tuple(draw.T))])
         else:
@@ -199,23 +199,6 @@ class PhasedVectorEnv(BatchedEnv):
             array[mask] = 0.0
         self._phase[mask] = 0
         self._step_in_phase[mask] = 0
-
-    def _refuse_options(self, options):
-        """Raise BadInput for an option of `reset` that this table does not have."""
-        known = ["x0", "draw"] if self.problem.scores else ["x0"]
-        if options.keys() - set(known):
-            allowed = "the only one is 'x0'" if len(known) == 1 else "they may be 'x0' and 'draw'"
-            raise BadInput(f"reset options are {options!r}; {allowed}")
-
-    def _checked(self, name, given, width):
-        """An option of `reset` as an array (N, width). Raises BadInput for anything else."""
-        try:
-            rows = np.asarray(given, dtype=np.float64)
-        except (TypeError, ValueError):
-            rows = np.empty(0)
-        if rows.shape != (self.num_envs, width) or not np.isfinite(rows).all():
-            raise BadInput(f"options[{name!r}] must be finite, of shape ({self.num_envs}, {width}); got {given!r}")
-        return rows
 
     def _observe(self):
         """The paper's o_t of the running steps."""

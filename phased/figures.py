@@ -9,8 +9,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Ellipse
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from drawing.animation import SIDES, Flight
+from drawing.animation import SIDES, Flight, handles_of
 from drawing.style import BOUNDARY, OPTIMUM, POLICY, SHOWN, TARGET
+from drawing.time_plots import plot_flight, time_panels
 from phased.metrics import NEAR_ORIGIN, comparable, cost_parts, cost_ratio
 from phased.problem import Phase, Problem
 
@@ -33,24 +34,18 @@ def trajectories_figure(problem: Problem, arrays: dict, title: str) -> Figure:
             velocity.plot(t, x[:, 1], **style)
             control.stairs(u, t, baseline=None, **style)  # a control is held over each step
     plane.plot(*arrays["x"][:SHOWN, 0].T, "k.")
-    mark_targets(problem, plane, position, velocity)
-    for end in problem.phase_ends[:-1]:
-        for ax in (position, velocity, control):
-            ax.axvline(t[end], **BOUNDARY)
-    low, high = problem.u_box[:, 0]
-    for bound in (low, high):
-        control.axhline(bound, **{**BOUNDARY, "linestyle": "--"})
-    for ax, limits in zip((position, velocity), problem.limits.T):
-        mark_limits(ax, limits)
+    mark_circles(problem, plane)
+    mark_table(problem, [position, velocity, control])
     plane.set(xlabel=position_name, ylabel=velocity_name, title="Phase plane")
     plane.axis("equal")
     position.set(xlabel="time (s)", ylabel=position_name, title="Position")
     velocity.set(xlabel="time (s)", ylabel=velocity_name, title="Velocity")
+    low, high = problem.u_box[:, 0]
     bounds = f"±{high}" if low == -high else f"{low:g} to {high:g}"
     control.set(xlabel="time (s)", ylabel=problem.control_labels[0], title=f"Control (bounds {bounds})")
     for ax in figure.axes:
         ax.grid(alpha=0.3)
-    figure.suptitle(title if problem.has_one_flight else f"{title}\nthe first {len(arrays['x'][:SHOWN])} starts")
+    figure.suptitle(with_count(problem, arrays, title))
     add_legend(figure, problem)
     return figure
 
@@ -58,29 +53,23 @@ def trajectories_figure(problem: Problem, arrays: dict, title: str) -> Figure:
 def time_figure(problem: Problem, arrays: dict, title: str) -> Figure:
     """Each state and each control of the first ten starts over time, with targets, bounds and the phases' ends."""
     labels = [*problem.state_labels, *problem.control_labels]
-    columns = min(3, len(labels))
-    rows = -(-len(labels) // columns)
-    figure = Figure(figsize=(4.2 * columns, 2.9 * rows + 1.0), layout="constrained")
-    panels = np.atleast_1d(figure.subplots(rows, columns)).ravel()
+    figure, panels = time_panels(labels, row_height=2.9, rest=1.0)
     for suffix, style in (("", POLICY), ("_reference", OPTIMUM)):
         for flight in flights_of(problem, arrays, suffix):
-            for k in range(problem.states):
-                panels[k].plot(flight.t, flight.y[:, k], **style)
-            for k in range(problem.controls):
-                panels[problem.states + k].stairs(flight.u[:, k], flight.t, baseline=None, **style)
-    for ax, label in zip(panels, labels):
-        ax.set(xlabel="time (s)", ylabel=label)
-        ax.grid(alpha=0.3)
-    for ax in panels[len(labels) :]:
-        ax.set_axis_off()
+            plot_flight(panels, flight, style)
     mark_table(problem, panels)
-    figure.suptitle(title if problem.has_one_flight else f"{title}\nthe first {len(arrays['x'][:SHOWN])} starts")
-    handles = [Line2D([], [], **POLICY, label="policy"), Line2D([], [], **OPTIMUM, label="optimum")]
+    figure.suptitle(with_count(problem, arrays, title))
+    handles = handles_of([POLICY, OPTIMUM])
     if any(phase.target is not None for phase in problem.phases):
         handles.append(Line2D([], [], **TARGET, linestyle="--", label="target"))
     handles.append(Line2D([], [], **BOUNDARY, label="bound, or end of a phase"))
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
     return figure
+
+
+def with_count(problem: Problem, arrays: dict, title: str) -> str:
+    """The title, with the number of starts that are shown."""
+    return title if problem.has_one_flight else f"{title}\nthe first {len(arrays['x'][:SHOWN])} starts"
 
 
 def flights_of(problem: Problem, arrays: dict, suffix: str) -> list[Flight]:
@@ -106,33 +95,21 @@ def mark_table(problem: Problem, panels):
                 ax.plot([start, end], [target, target], linestyle="--", zorder=3, **TARGET)
         start = end
     for ax, limits in zip(panels, [*problem.limits.T, *problem.u_box.T]):
-        mark_limits(ax, limits)
+        for limit in limits[np.isfinite(limits)]:
+            ax.axhline(limit, **{**BOUNDARY, "linestyle": "--"})
     if not problem.has_events:
         for end in problem.phase_ends[:-1]:
             for ax in panels:
                 ax.axvline(end * problem.dt, **BOUNDARY)
 
 
-def mark_limits(ax, limits):
-    """Draw dashed lines at those of two bounds that are finite."""
-    for limit in limits:
-        if np.isfinite(limit):
-            ax.axhline(limit, **{**BOUNDARY, "linestyle": "--"})
-
-
-def mark_targets(problem: Problem, plane, position, velocity):
-    """Draw in green each phase's target circle in the phase plane, and its target as a dashed line over time."""
-    start = 0.0
+def mark_circles(problem: Problem, plane):
+    """Draw in green each phase's target circle in the phase plane, with its number if there are several."""
     for k, phase in enumerate(problem.phases, start=1):
         add_circle(problem, phase, plane)
         if problem.waypoints and None not in problem.targets_of(phase):
             offset = (-3, -16) if k == 1 else (-10, 5)  # points: the paths come in from the other sides
             plane.annotate(f"{k}", phase.target, offset, textcoords="offset points", color="tab:green", weight="bold")
-        end = start + phase.steps * problem.dt
-        for ax, value in zip((position, velocity), problem.targets_of(phase)):
-            if value is not None:
-                ax.plot([start, end], [value, value], linestyle="--", zorder=3, **TARGET)
-        start = end
 
 
 def add_circle(problem: Problem, phase: Phase, plane, zorder: int = 3):
@@ -149,7 +126,7 @@ def add_circle(problem: Problem, phase: Phase, plane, zorder: int = 3):
 
 def add_legend(figure: Figure, problem: Problem):
     """One legend for all panels, below them."""
-    handles = [Line2D([], [], **POLICY, label="policy"), Line2D([], [], **OPTIMUM, label="optimum")]
+    handles = handles_of([POLICY, OPTIMUM])
     radii = dict.fromkeys(str(phase.radius) for phase in problem.phases if phase.has_circle)
     if any(phase.target is not None for phase in problem.phases):
         label = f"target (radius {', '.join(radii)})" if radii else "target"

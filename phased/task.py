@@ -14,8 +14,6 @@ from phased.metrics import flight_metrics, near_origin_metrics, ratio_metrics
 from phased.problem import Problem, flights_of_seed
 from phased.table import table
 
-KEPT_STARTS = 30  # starts that a results folder keeps
-
 
 @dataclass(frozen=True)
 class PhasedTask(SampledTask):
@@ -66,9 +64,6 @@ class PhasedTask(SampledTask):
             return 10
         return super().default_flights(is_brief)
 
-    def refusal(self, trains: bool, **env_options) -> tuple[str, str] | None:
-        return None
-
     # --- words and pictures
 
     def table(self, metrics: dict) -> str:
@@ -99,13 +94,15 @@ class PhasedTask(SampledTask):
         return f"{title} ({metrics['eval_starts']} starts)"
 
     def figures(self, arrays: dict, metrics: dict, curves: list[dict]) -> dict:
+        from drawing.training import Miss, training_figure
         from phased.figures import cost_error_figure, costs_figure, trajectories_figure
 
         problem = self.problem
         title = self.headline(metrics)
         figures = {}
         if curves:
-            figures["training.png"] = self.training_figure(metrics, curves)
+            miss = Miss("eval/ratio_of_sums", "cost / optimum's, less 1, mean action", subtract=1.0)
+            figures["training.png"] = training_figure(curves, title, metrics["reference_episodic_return"], miss)
         figures["trajectories.png"] = trajectories_figure(problem, arrays, title)
         if problem.has_one_flight:
             return figures
@@ -114,13 +111,6 @@ class PhasedTask(SampledTask):
         if problem.states == 2 and problem.weighted and not problem.waypoints:
             figures["cost_error.png"] = cost_error_figure(problem, arrays, title)
         return figures
-
-    def training_figure(self, metrics: dict, curves: list[dict]):
-        """The training curves, with the extra cost of the mean action over the optimum."""
-        from drawing.training import Miss, training_figure
-
-        miss = Miss("eval/ratio_of_sums", "cost / optimum's, less 1, mean action", subtract=1.0)
-        return training_figure(curves, self.headline(metrics), metrics["reference_episodic_return"], miss)
 
     def animation(self, arrays: dict, metrics: dict):
         from phased.animation import problem_animation
@@ -132,14 +122,7 @@ class PhasedTask(SampledTask):
     def required_arrays(self, metrics: dict) -> set[str]:
         return {"t", "x", "u", "reward", "cost", "x_reference", "u_reference", "cost_reference"}
 
-    def kept_arrays(self, arrays: dict) -> dict:
-        """The arrays of the first `KEPT_STARTS` starts. All arrays but the times are by start."""
-        return {key: array if key == "t" else array[:KEPT_STARTS] for key, array in arrays.items()}
-
     # --- commands
-
-    def speed_cases(self) -> list[tuple[str, dict, list | None]]:
-        return [("", {}, None)]
 
     def add_arguments(self, parser) -> None:
         parser.add_argument("--starts", type=integer(1, 100_000), default=1000, metavar="N", help="default 1000")

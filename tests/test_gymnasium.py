@@ -120,6 +120,9 @@ def test_what_a_training_hands_over_is_checked(env_id):
         for options, held in (({"training": {"flights_per_start": 2}}, 2), (None, 1)):
             env.reset(seed=0, options=options)
             assert batch.training.flights_per_start == held
+        with pytest.raises(BadInput):
+            env.reset(options={"draw": "no draw", "training": {"flights_per_start": 2}})
+        assert batch.training.flights_per_start == 1  # a refused reset changes nothing
 
 
 @every_kind
