@@ -7,8 +7,8 @@
 
 Reading order: arguments, recipes, problem, Gated Transformer-XL, agent, PPO, what we add to PPO, training, main.
 From the first section "Shared" on, all ppo_gtrxl_*.py are the same but for lines that end with "# this problem". A
-section with "ours" in its heading contains nothing from the paper. In the other sections a comment marks what is ours.
-"Line 8" means line 8 of Algorithm 1, "Eq. (7)" the seventh numbered equation of the paper.
+section headed "Problem, ours" or "Shared, ours" contains nothing from the paper. In the other sections a comment marks
+what is ours. "Line 8" means line 8 of Algorithm 1, "Eq. (7)" the seventh numbered equation of the paper.
 
 T is the number of steps, N of environments, H of heads. L is the memory length, d the width, and dk = d / H.
 Algorithm 1 writes E for our N, and N for its iterations.
@@ -432,9 +432,9 @@ class Agent(nn.Module):
 
     A block's memory at step t is what the block received at the steps t - L to t - 1. Before the first step it is m_0.
     A rollout stores the memory as keys and values (`encode_step`). Training stores only m_0. It computes the whole
-    episode again from m_0 with the current weights (`encode`), so gradients flow through the memory. This replaces
-    lines 10, 11 and 17. Line 10 also stores the action a_t. We leave the action out, because two fully observed states
-    in a row tell which action lay between them.
+    episode again from m_0 with the current weights (`encode`), so gradients flow through the memory. This replaces how
+    lines 10, 11 and 17 keep the memory. Line 10 also stores the action a_t. We leave the action out, because two fully
+    observed states in a row tell which action lay between them.
     """
 
     def __init__(self, args, envs):
@@ -763,7 +763,10 @@ def returns_baseline(batch, gamma, group):
 
 # Shared: training (Algorithm 1) and main ------------------------------------------------------------------------------
 def minibatches(args, envs, device):
-    """Yield (epoch, minibatch, episodes) of lines 15 and 16. Each epoch has every episode once, in a new order."""
+    """Yield the numbers of epoch and minibatch, and its episodes' indices `mb`: lines 15 and 16.
+
+    Each epoch has every episode once, in a new order.
+    """
     for epoch in range(1, args.update_epochs + 1):
         order = torch.randperm(envs.num_envs, device=device)
         for minibatch, mb in enumerate(order.tensor_split(args.num_minibatches), start=1):

@@ -1,4 +1,6 @@
-"""What measures the rest. Each is a command, run from the repository's root: `python -m benchmarks.NAME --help`.
+"""What measures the rest: commands, run from the repository's root by `python -m benchmarks.NAME --help`.
+
+`policies.py` and `records.py` are no commands; the others share them.
 
 | command | what it does |
 |---|---|

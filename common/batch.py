@@ -81,9 +81,9 @@ class BatchedEnv(VectorEnv):
     - `_snapshot()` returns new arrays: time (N,) in s, the last control (N, m) and state (N, n)
     - `_make_sheet()` returns the drawing, whose `frame(t, u, y)` is a flight's picture
 
-    Every problem has three attributes with a default: `dt`, the step in s (1); `phase` (N,), the 0-based phase in which
-    the running steps begin (0); and `observation_scale`, a usual size of each observation (1), by which the networks of
-    our scripts divide the observation.
+    Every problem has four attributes with a default: `dt`, the step in s (1); `phase` (N,), the 0-based phase in which
+    the running steps begin (0); `observation_scale`, a usual size of each observation (1), by which the networks of our
+    scripts divide the observation; and `generators`, its streams of random numbers, which a resume restores.
 
     `reset(options={"training": {name: value}})` hands over what only a training changes. The names are the fields of
     `Training` or of the problem's own kind of it. The values stand in `self.training` and hold until the next `reset`.
@@ -93,7 +93,7 @@ class BatchedEnv(VectorEnv):
     With 1 each environment flies its own start. The last group is smaller if G does not divide N. A dispersed rocket's
     start is its vehicle and air, and every second group has the draw of the group before it with the signs changed
     (antithetic variates). This holds for the episodes that begin at a `reset`, and our scripts train only on these. An
-    autoreset groups the environments that ended in the same step, for any k.
+    autoreset groups the environments that ended in the same step, in their order.
     """
 
     metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
@@ -352,7 +352,7 @@ class SingleEnv(gym.Env):
 
 def check_options(environment: type, options: dict, *others: str):
     """Raise BadInput for an option that is neither an argument of an environment's constructor nor in `others`."""
-    given_otherwise = ("num_envs", "problem", "mission")
+    given_otherwise = ("num_envs", "problem", "mission", "lander")
     taken = [name for name in inspect.signature(environment).parameters if name not in given_otherwise]
     allowed = [*taken, *others]
     for name, value in options.items():

@@ -72,7 +72,7 @@ def noted(hint: Any) -> list:
 
 
 def parse_schedules(args) -> None:
-    """Replace the number or words of each schedule by the Schedule. Raises ValueError that says what is none."""
+    """Replace the number or words of each schedule by the Schedule. Raises ValueError with words that are none."""
     for field in fields(args):
         if isinstance(field.default, Schedule):
             setattr(args, field.name, Schedule(getattr(args, field.name)))

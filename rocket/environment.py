@@ -64,7 +64,8 @@ class RocketTraining(Training):
     # scale of R_terminal in the reward, a curriculum; `final_info` keeps TERMINAL_SCALE
     terminal_scale: float = numeric(TERMINAL_SCALE, low=1e-12)
     guidance: bool = checked(False, lambda value: value in (False, True), "must be True or False")  # pay R_guidance
-    mass_weight: float = numeric(0.0)  # reward lost per `mass_unit` of propellant burnt in the last phase
+    # reward lost per `mass_unit` of propellant burnt in the last phase; our script pays `mass_rewards` instead
+    mass_weight: float = numeric(0.0)
     # "ignition" for a while where the environment's `failure_time` is "random" (None: the environment's)
     failure_time: str | None = checked(
         None, lambda value: value in (None, *FAILURE_TIMES), f"must be None or one of {', '.join(FAILURE_TIMES)}"
@@ -75,15 +76,15 @@ class RocketVectorEnv(BatchedEnv):
     """N launches of a mission's rocket into its orbit, steered by the thrust direction, in steps of 2 s.
 
     Observation: [r (3) m, v (3) m/s, m kg, t_norm, phi], r and v in ECI. t_norm, the paper's name, is the time that is
-    left, 1 - t / rocket.end_time (961 s). phi
-    is the phase at the step's start, from 0 to 1 (the paper counts 0 to 3). A burn is a phase.
+    left, 1 - t / rocket.end_time (961 s). phi is the phase at the step's start, from 0 to 1 (the paper counts 0 to 3).
+    A burn is a phase.
 
     Action: the thrust direction, of any length but 0, which raises BadInput. It is normalised here and held in ECI over
     the step. With `action_frame="local"` its components are up, along-track and cross-track of the target plane, at the
     step's start.
 
-    A step is one RK4 step between two events. Events are staging, a stage that runs dry (`table_isp`) and the end of
-    the episode. They are met exactly.
+    A step is one RK4 step between two events. Events are staging, a stage that runs dry (`table_isp`), the strike
+    of a failure and the end of the episode. They are met exactly.
 
     With `dispersion` D > 0 flights differ. Each group of `flights_per_start` episodes draws k standard scores in the
     order of `draw_names`, clipped at +-3 (`draw_bounds`). It flies the vehicle of `draw_vehicles`, which differs from

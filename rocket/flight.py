@@ -1,7 +1,8 @@
 """The flight of drawn or nominal vehicles without an environment: step times, the way between events, the cut-off.
 
 These are pure functions. The environment flies by them, and the LQR is linearised along them. n is the number of
-flights, A the number of arcs of `Vehicles`.
+flights, A the number of arcs of `Vehicles`. An event is the end of a burn, a stage that runs dry, or the strike of a
+failure. An arc is the time between two events.
 
 Reading order: steps, the flight of a step, the flight of an arc, the cut-off.
 """
