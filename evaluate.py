@@ -30,7 +30,6 @@ from common.evaluations import read_evaluation, read_json, read_metrics, refuse_
 from common.files import read_npz, write_bytes, write_npz
 from common.policies import script_of
 from common.tasks import task_of
-from drawing.evaluation import draw_animation, draw_figures
 from exports.folders import EPOCH, LAUNCH_LONGITUDE, export, page
 
 
@@ -156,6 +155,10 @@ def redraw(folder) -> list[Path]:
     metrics, arrays = read_evaluation(folder)
     curves = {path.stem: read_csv(path) for path in sorted((folder / "seeds").glob("*.csv"))}
     own = curves.pop(str(metrics["seed"]), None) or read_curve(folder)
+    from drawing.evaluation import (
+        draw_figures,  # only a drawing should wait the quarter of a second that Matplotlib takes
+    )
+
     return draw_figures(folder, arrays, metrics, [own, *curves.values()] if own else [])
 
 
@@ -166,6 +169,8 @@ def animate(folder) -> Path:
     """
     folder = Path(folder)
     metrics, arrays = read_evaluation(folder)
+    from drawing.evaluation import draw_animation
+
     return draw_animation(folder, arrays, metrics)
 
 

@@ -43,7 +43,6 @@ from common.evaluations import write_evaluation
 from common.flags import Policy, Range, Words, facts, plain_args
 from common.schedule import Schedule
 from common.tasks import Task, task_of
-from drawing.evaluation import draw_animation, draw_figures
 
 gc.freeze()  # imported modules are never garbage, and looking through them takes a fifth of the time of --help
 
@@ -660,6 +659,11 @@ class Run:
             paths = (self.folder / name for name in ("agent.safetensors", "eval.json", "eval.npz"))
             write_evaluation(metrics, arrays, *paths)
         if args.capture_video:
+            from drawing.evaluation import (  # only a drawing should wait the quarter of a second that Matplotlib takes
+                draw_animation,
+                draw_figures,
+            )
+
             draw_figures(self.folder, arrays, metrics, [read_curve(self.folder)])
             draw_animation(self.folder, arrays, metrics)
         print(self.task.table(metrics))

@@ -5,12 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from common.tasks import task_of
+from drawing.style import save_figures
 
 
 def draw_figures(folder, arrays: dict, metrics: dict, curves: list[dict]) -> list[Path]:
     """Draw the figures of an evaluation and of these training curves into folder/figures. Returns their paths."""
-    from drawing.style import save_figures  # only a drawing should wait the quarter of a second that Matplotlib takes
-
     return save_figures(Path(folder) / "figures", task_of(metrics["env_id"]).figures(arrays, metrics, curves))
 
 

@@ -16,6 +16,7 @@ import evaluate
 from common.evaluations import read_evaluation
 from drawing import animation
 from drawing.animation import Flight
+from drawing.evaluation import draw_animation
 from phased.animation import PhasePlane
 from rocket.animation import AscentSheet
 
@@ -107,7 +108,7 @@ def test_failing_write_leaves_the_old_gif(tmp_path, monkeypatch):
     (tmp_path / "figures" / "animation.gif").write_bytes(b"old")
     monkeypatch.setattr(PhasePlane, "show", lambda *sides, ended: 1 / 0)
     with pytest.raises(ZeroDivisionError):
-        evaluate.draw_animation(tmp_path, arrays, metrics)
+        draw_animation(tmp_path, arrays, metrics)
     assert [path.read_bytes() for path in (tmp_path / "figures").iterdir()] == [b"old"]
 
 

@@ -23,6 +23,7 @@ import ppo_gtrxl_vdp as script
 from common.errors import BadInput, NoOptimum
 from common.integration import falling_root
 from common.tasks import task_of
+from drawing.evaluation import draw_figures
 from envs import PROBLEMS, Phase, Problem, fly
 from phased.problem import flights_of_seed
 from problems.cart_pole import CART_POLE, cart_pole
@@ -307,7 +308,7 @@ def test_every_table_of_ours_is_measured_and_drawn(env_id, tmp_path):
     assert task_of(env_id).required_arrays(metrics) <= arrays.keys()
     table = task_of(env_id).table(metrics)
     assert table.startswith(env_id) and "nan" not in table
-    for path in evaluate.draw_figures(tmp_path, arrays, metrics, []):
+    for path in draw_figures(tmp_path, arrays, metrics, []):
         assert path.stat().st_size > 5000
     animation = task_of(env_id).animation(arrays, metrics)
     assert animation.frame(5).shape == (450, 800, 3)

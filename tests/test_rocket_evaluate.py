@@ -12,6 +12,7 @@ import envs
 import evaluate
 from common.files import write_json, write_npz
 from common.tasks import task_of
+from drawing.evaluation import draw_figures
 from rocket import optimum
 from rocket.metrics import rocket_metrics
 
@@ -434,7 +435,7 @@ def test_figures_and_rows_of_a_results_folder(flown, tmp_path):
     metrics, arrays = flown[CUTOFF]
     steps = np.arange(1, 41)
     curve = {tag: (steps, 0.9**steps) for tag in ("charts/episodic_return", "losses/total_loss", "eval/error_norm")}
-    drawn = evaluate.draw_figures(tmp_path, arrays, metrics, [curve])
+    drawn = draw_figures(tmp_path, arrays, metrics, [curve])
     assert {path.name for path in drawn} == {"training.png", "trajectory.png", "orbit.png"}
     (tmp_path / "seeds").mkdir()
     for seed, error in ((1, metrics["error_norm"]), (2, 0.5)):

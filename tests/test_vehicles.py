@@ -21,6 +21,7 @@ import baselines
 import envs
 import evaluate
 from common.tasks import task_of
+from drawing.evaluation import draw_figures
 from envs import ROCKET, ROCKETS, BadInput, Burn, Engine, Rocket, register_rocket
 from rocket import optimum
 from rocket.metrics import rocket_metrics
@@ -391,7 +392,7 @@ def test_a_rocket_of_your_own_from_reference_to_figures(solved, env_id, tmp_path
     table = table_of(metrics)
     (row,) = (line for line in table.splitlines() if "argument of perigee" in line)
     assert (row.split()[-4:] == ["-"] * 4) == (rocket.e == 0) and table.startswith(env_id)
-    paths = evaluate.draw_figures(tmp_path, arrays, metrics, [])
+    paths = draw_figures(tmp_path, arrays, metrics, [])
     assert [path.name for path in paths] == ["trajectory.png", "orbit.png"] and all(path.exists() for path in paths)
 
 
