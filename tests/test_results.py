@@ -11,6 +11,7 @@ import safetensors
 
 import envs
 from benchmarks import run_seeds
+from common.schedule import Schedule
 
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "results"
@@ -52,6 +53,8 @@ def test_a_policy_was_trained_by_the_command_that_its_list_gives(folder, monkeyp
     table = vars(envs.LANDERS[args["env_id"]]) if args["env_id"] in envs.LANDERS else {}
 
     def given(name, value):
+        if isinstance(getattr(script.Args, name, None), Schedule):  # two ways to write a jump are one schedule
+            return Schedule(value).over(args["total_updates"]).tolist()
         return table.get(name) if value is None else value
 
     differ = {name for name, value in job.args.items() if given(name, args[name]) != given(name, value)}
