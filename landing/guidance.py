@@ -181,9 +181,10 @@ class PlanJob(NamedTuple):
 def plan_one(job: PlanJob) -> tuple[Trajectory | None, float]:
     """The plan of one flight, or None if IPOPT finds none, and the seconds that it took on one core."""
     begin = time.process_time()
-    guesses = [job.guess]
     if job.guess is None:
         guesses = straight_lines(job.lander, job.descent, DURATIONS, PLAN_INTERVALS)
+    else:
+        guesses = [job.guess]
     plan = None
     for guess in guesses:
         mesh = LandingMesh.stretched(PLAN_INTERVALS, guess.seconds)
