@@ -59,6 +59,15 @@ class Training:
             refuse_unless(fits, f"training's {each.name}", repr(value), each.metadata["allowed"])
 
 
+def refuse_assignment(env, name: str, training: Training):
+    """Raise AttributeError for an attribute that only a training may hand over, because assigning it does nothing."""
+    if name in vars(training) and not hasattr(env, name):
+        handed_over = f"reset(options={{'training': {{{name!r}: ...}}}})"
+        raise AttributeError(
+            f"{type(env).__name__} has no attribute {name!r}; a training hands it over by {handed_over}"
+        )
+
+
 class BatchedEnv(VectorEnv):
     """The base of every problem's batch: step counters, checks of the action, and autoreset.
 
@@ -136,6 +145,11 @@ class BatchedEnv(VectorEnv):
         self.t = np.zeros(num_envs, dtype=np.int64)  # steps flown in the running episode
         self.observation_scale = np.ones(single_observation_space.shape)
         self._was_reset = False
+
+    def __setattr__(self, name, value):
+        if "_was_reset" in self.__dict__:  # it is made whole; options of the constructor may have a training's names
+            refuse_assignment(self, name, self.training)
+        super().__setattr__(name, value)
 
     @property
     def dt(self) -> float:
@@ -321,6 +335,11 @@ class SingleEnv(gym.Env):
         self._running = False  # from a reset to the end of its episode
         self.observation_space = batch.single_observation_space
         self.action_space = batch.single_action_space
+
+    def __setattr__(self, name, value):
+        if name != "batch":
+            refuse_assignment(self, name, self.batch.training)
+        super().__setattr__(name, value)
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
         """Start anew. Returns the observation and an empty info. `options` are the batch's without their first axis."""

@@ -75,7 +75,11 @@ def parse_schedules(args) -> None:
     """Replace the number or words of each schedule by the Schedule. Raises ValueError with words that are none."""
     for field in fields(args):
         if isinstance(field.default, Schedule):
-            setattr(args, field.name, Schedule(getattr(args, field.name)))
+            try:
+                schedule = Schedule(getattr(args, field.name))
+            except ValueError as error:
+                raise ValueError(f"{field.name}: {error}") from None
+            setattr(args, field.name, schedule)
 
 
 def plain_args(args) -> dict[str, Any]:

@@ -27,7 +27,8 @@ class Schedule:
                 raise ValueError
         except ValueError:
             allowed = "must be a number, or points as 0:-1 0.4:-2 1:-6 whose places rise from 0 to 1"
-            raise ValueError(f"{self.words}: {allowed}") from None
+            given = self.words or "nothing"
+            raise ValueError(f"{given}: {allowed}") from None
 
     def at(self, progress: float) -> float:
         """The value at a progress, which is 0 in the first update and 1 in the last."""

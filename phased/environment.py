@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
 
-from common.batch import RENDERED, BatchedEnv, SingleEnv, Training, check_options, checked, numeric, refuse_autoreset
+from common.batch import RENDERED, BatchedEnv, SingleEnv, Training, check_options, numeric, refuse_autoreset
 from common.errors import refuse_unless
 from common.flying import fly_until_ended
 from common.integration import falling_root
@@ -22,21 +22,11 @@ from phased.problem import LARGEST_SCORE, PROBLEMS, Phase, Problem
 TRANSITION_STEPS = 5
 
 
-def are_scales(scales) -> bool:
-    """Whether `scales` are factors on radii, one number or one for each phase."""
-    try:
-        array = np.asarray(scales, dtype=np.float64)
-    except (TypeError, ValueError):
-        return False
-    return array.ndim <= 1 and bool((np.isfinite(array) & (array >= 0)).all())
-
-
 @dataclass(frozen=True)
 class PhasedTraining(Training):
     """What a training of a small problem hands over. The defaults are the paper's reward."""
 
-    # factor on the radii in which the reward pays the bonus, one number or one for each phase
-    radius_scale: float = checked(1.0, are_scales, "must be numbers of at least 0, one or one for each phase")
+    radius_scale: float = numeric(1.0)  # factor on the radii in which the reward pays the bonus
     # distance beyond these radii over which the bonus falls linearly to 0 (0: a step)
     bonus_width: float = numeric(0.0)
 
@@ -356,7 +346,7 @@ class PhasedVectorEnv(BatchedEnv):
         for k in np.unique(of_phase):
             some = ending[of_phase == k]
             x, p = (tuple(value[some] for value in values) for values in (self.x, self._parameters))
-            scale = np.broadcast_to(self.training.radius_scale, len(phases))[k]
+            scale = self.training.radius_scale
             cost, error, radius = end_of_phase(self.problem, phases[k], x, p)
             self._terminal_error[some, k] = error
             self._costs["terminal"][some] += cost

@@ -63,12 +63,14 @@ class RocketTraining(Training):
 
     # scale of R_terminal in the reward, a curriculum; `final_info` keeps TERMINAL_SCALE
     terminal_scale: float = numeric(TERMINAL_SCALE, low=1e-12)
-    guidance: bool = checked(False, lambda value: value in (False, True), "must be True or False")  # pay R_guidance
+    guidance: bool = checked(False, lambda value: isinstance(value, bool), "must be True or False")  # pay R_guidance
     # reward lost per `mass_unit` of propellant burnt in the last phase; our script pays `mass_rewards` instead
     mass_weight: float = numeric(0.0)
     # "ignition" for a while where the environment's `failure_time` is "random" (None: the environment's)
     failure_time: str | None = checked(
-        None, lambda value: value in (None, *FAILURE_TIMES), f"must be None or one of {', '.join(FAILURE_TIMES)}"
+        None,
+        lambda value: value is None or (isinstance(value, str) and value in FAILURE_TIMES),
+        f"must be None or one of {', '.join(FAILURE_TIMES)}",
     )
 
 
