@@ -15,12 +15,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import NamedTuple
+from contextlib import suppress
 
 import numpy as np
 
 from common.errors import NoOptimum
-from common.workers import Workers
 from landing.environment import PERIOD
 from landing.lander import Lander
 from landing.optimum import Descent, LandingMesh, Trajectory, energy_optimal_time, solve_from_guess, straight_lines
@@ -169,33 +168,6 @@ PLAN_INTERVALS = 25
 DURATIONS = (0.8, 1.2)  # guesses of a first plan's, in units of the energy-optimal time
 
 
-class PlanJob(NamedTuple):
-    """A plan to be solved; it holds all that a process needs."""
-
-    lander: Lander
-    descent: Descent
-    limits: tuple[float, float]  # N, least and greatest thrust
-    guess: Trajectory | None  # the rest of the last plan
-
-
-def plan_one(job: PlanJob) -> tuple[Trajectory | None, float]:
-    """The plan of one flight, or None if IPOPT finds none, and the seconds that it took on one core."""
-    begin = time.process_time()
-    if job.guess is None:
-        guesses = straight_lines(job.lander, job.descent, DURATIONS, PLAN_INTERVALS)
-    else:
-        guesses = [job.guess]
-    plan = None
-    for guess in guesses:
-        mesh = LandingMesh.stretched(PLAN_INTERVALS, guess.seconds)
-        try:
-            plan = solve_from_guess(job.lander, job.descent, guess, mesh, limits=job.limits)
-            break
-        except NoOptimum:
-            continue
-    return plan, time.process_time() - begin
-
-
 class Replanned:
     """The law that flies the fuel optimum of the rest of the flight, solved again and again with the estimate.
 
@@ -213,20 +185,12 @@ class Replanned:
         plain   53 %       +1.4 %
         wary     1 %       +9 %
 
-    `processes` share the solves, which changes only the time. `failed` counts the solves without a plan. `seconds` has
-    one number for each solve.
+    `failed` counts the solves without a plan. `seconds` has one number for each solve.
     """
 
-    def __init__(self, lander: Lander, is_wary: bool = False, processes: int = 1):
+    def __init__(self, lander: Lander, is_wary: bool = False):
         self.lander, self.is_wary = lander, is_wary
         self.failed, self.seconds = 0, []
-        self.workers = Workers(processes)
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *error):
-        self.workers.close()
 
     def __call__(self, obs, t):
         if t == 0:
@@ -263,8 +227,8 @@ class Replanned:
 
     def _replan(self, obs, flights):
         """Make new plans for these flights, indices of obs (n, obs)."""
-        jobs = [self._job(obs[k], k) for k in flights]
-        for k, (plan, seconds) in zip(flights, self.workers.map(plan_one, jobs)):
+        for k in flights:
+            plan, seconds = self._plan(obs[k], k)
             self.seconds.append(seconds)
             self.planned_with[k] = self.estimate.effectiveness[k]
             if plan is None:
@@ -275,8 +239,11 @@ class Replanned:
             self.thrust[k] = plan.thrust
             self.y[k] = plan.y
 
-    def _job(self, obs, k: int) -> PlanJob:
-        """The job of planning flight k at obs (obs,), by the estimate, with the rest of the last plan as the guess."""
+    def _plan(self, obs, k: int) -> tuple[Trajectory | None, float]:
+        """The plan of flight k at obs (obs,) by the estimate, or None if IPOPT finds none, and the seconds it took.
+
+        The guess is the rest of the last plan.
+        """
         effectiveness = self.estimate.effectiveness[k]
         plan = self.plans[k]
         state = np.append(obs[:6], self.estimate.mass[k])
@@ -284,12 +251,19 @@ class Replanned:
         is_whole = effectiveness.min() > WHOLE
         share = WARY_RESERVE if self.is_wary and is_whole else RESERVE
         limits = PLANNED_LEAST * self.lander.least_thrust, share * self.lander.greatest_thrust
+        begin = time.process_time()
         if plan is None:
-            return PlanJob(self.lander, descent, limits, None)
-        passed = obs[6] - self.ends[k, 0]
-        t = np.linspace(passed, plan.seconds, PLAN_INTERVALS + 1)
-        rest = Trajectory(t - passed, plan.thrust_at((t[:-1] + t[1:]) / 2), plan.state_at(t))
-        return PlanJob(self.lander, descent, limits, rest)
+            guesses = straight_lines(self.lander, descent, DURATIONS, PLAN_INTERVALS)
+        else:
+            passed = obs[6] - self.ends[k, 0]
+            t = np.linspace(passed, plan.seconds, PLAN_INTERVALS + 1)
+            guesses = [Trajectory(t - passed, plan.thrust_at((t[:-1] + t[1:]) / 2), plan.state_at(t))]
+        for guess in guesses:
+            mesh = LandingMesh.stretched(PLAN_INTERVALS, guess.seconds)
+            with suppress(NoOptimum):
+                found = solve_from_guess(self.lander, descent, guess, mesh, limits=limits)
+                return found, time.process_time() - begin
+        return None, time.process_time() - begin
 
     def _acceleration(self, r, v, now) -> np.ndarray:
         """The plans' acceleration (n, 3) over the period from `now` (n,) s on, with gravity and feedback."""

@@ -111,6 +111,10 @@ class Flights(NamedTuple):
     failed: np.ndarray  # (3, n) effectiveness of each axis after the failure; 1 in a healthy flight
     strike: np.ndarray  # (n,) s, when the failure strikes; infinite in a healthy flight
 
+    def one(self, k: int) -> Flights:
+        """Flight k alone."""
+        return Flights(*(array[..., [k]] for array in self))
+
 
 # a draw is a row of uniform numbers from 0 to 1
 DRAW = ("x", "y", "z", "vx", "vy", "vz", "mass", "gx", "gy", "gz", "failure", "axis", "moment")

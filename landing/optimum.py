@@ -33,11 +33,11 @@ class Descent(NamedTuple):
     strike: float  # s after the beginning, when the failure strikes; infinite without one
 
     @classmethod
-    def of(cls, flights: Flights, k: int) -> Descent:
-        """The whole flight k."""
-        state = np.concatenate([flights.r[:, k], flights.v[:, k], flights.mass[[k]]])
-        strike = PERIOD * np.ceil(flights.strike[k] / PERIOD)  # the beginning of one of the environment's periods
-        return cls(state, flights.gravity[:, k], flights.failed[:, k], float(strike))
+    def of(cls, flight: Flights) -> Descent:
+        """The whole of one flight."""
+        state = np.concatenate([flight.r[:, 0], flight.v[:, 0], flight.mass])
+        strike = PERIOD * np.ceil(flight.strike[0] / PERIOD)  # the beginning of one of the environment's periods
+        return cls(state, flight.gravity[:, 0], flight.failed[:, 0], float(strike))
 
     def effectiveness(self, begins: np.ndarray) -> np.ndarray:
         """The effectiveness (K, 3) of each axis in intervals that begin at these times (K,) in s."""
@@ -359,15 +359,15 @@ def held_optimum(
     return min(tried.values(), key=lambda path: path.fuel)
 
 
-def optimise_landing(lander: Lander, flights: Flights, k: int, glide_slope: float | None = 0.0) -> dict:
-    """The landing of flight k with the least propellant, if its mass, gravity and failure are known.
+def optimise_landing(lander: Lander, flight: Flights, glide_slope: float | None = 0.0) -> dict:
+    """The landing of one flight with the least propellant, if its mass, gravity and failure are known.
 
     Returns u (T, 3) in N, commands held for a period each, `fuel_kg`, `final_time` (s), and t (T+1,) and y (T+1, 7) of
     the flight that the environment makes of them. `glide_slope` is that of `solve_from_guess`. A path that may go below
     ground (None) cannot be flown by the environment. It is shot through the dynamics instead. Raises NoOptimum if IPOPT
     finds none, or if the replay does not end at rest on the pad with the solution's propellant.
     """
-    descent = Descent.of(flights, k)
+    descent = Descent.of(flight)
     clock = SolveClock("landing")
     stretched = stretched_optimum(lander, descent, glide_slope, clock)
     path = held_optimum(lander, descent, stretched, glide_slope, clock)
@@ -375,7 +375,7 @@ def optimise_landing(lander: Lander, flights: Flights, k: int, glide_slope: floa
     if glide_slope is None:
         y, end = shot(lander, descent, path)
     else:
-        y, end = replayed(lander, flights, k, u)
+        y, end = replayed(lander, flight, u)
     position_error = np.linalg.norm(y[-1, :3])
     speed = np.linalg.norm(y[-1, 3:6])
     is_soft = position_error < POSITION_TOLERANCE and speed < SPEED_TOLERANCE
@@ -388,13 +388,12 @@ def optimise_landing(lander: Lander, flights: Flights, k: int, glide_slope: floa
     return {"u": u, "fuel_kg": fuel, "final_time": end, "t": np.append(path.t[:-1], end), "y": y}
 
 
-def replayed(lander: Lander, flights: Flights, k: int, u: np.ndarray) -> tuple[np.ndarray, float]:
-    """The states (T+1, 7) of flight k under the commands u (T, 3), by the environment, and its time of touchdown."""
+def replayed(lander: Lander, flight: Flights, u: np.ndarray) -> tuple[np.ndarray, float]:
+    """The states (T+1, 7) of one flight under the commands u (T, 3), by the environment, and its time of touchdown."""
     batch = LanderVectorEnv(lander)
-    start = np.concatenate([flights.r[:, k], flights.v[:, k]])
-    batch.reset(options={"x0": start[None]})
-    batch.flights = Flights(*(array[..., [k]] for array in flights))
-    batch.mass = flights.mass[[k]].copy()
+    batch.reset(options={"x0": np.vstack([flight.r, flight.v]).T})
+    batch.flights = flight
+    batch.mass = flight.mass.copy()
     y = [state_of(batch)[0]]
     for command in u:
         batch.advance(command[None] / lander.greatest_thrust)
@@ -440,7 +439,7 @@ def kept_references(lander: Lander, rows: bytes, failure: tuple, processes: int)
     draw = np.frombuffer(rows).reshape(-1, len(DRAW))
     drawn = draw_flights(lander, draw, *failure)
     _, first, of_draw = np.unique(np.vstack(drawn), axis=1, return_index=True, return_inverse=True)
-    jobs = [(lander, Flights(*(array[..., [k]] for array in drawn)), 0) for k in first]
+    jobs = [(lander, drawn.one(k)) for k in first]
     if len(jobs) > 1:
         print(f"solving the optima of {len(jobs)} landings, once", file=sys.stderr, flush=True)
     with Workers(processes) as workers:
@@ -468,7 +467,7 @@ def kept_references(lander: Lander, rows: bytes, failure: tuple, processes: int)
 
 
 def solve_job(job) -> dict | NoOptimum:
-    """The optimum of the job (lander, flights, k), or the NoOptimum that says why there is none."""
+    """The optimum of the job (lander, flight), or the NoOptimum that says why there is none."""
     try:
         return optimise_landing(*job)
     except NoOptimum as error:

@@ -31,7 +31,7 @@ def report_constraints(env_id: str) -> tuple[dict, dict]:
     print(f"{env_id:<32}{'propellant (kg)':>16}{'duration (s)':>14}{'solved in (s)':>15}")
     for name, glide_slope in CONSTRAINTS.items():
         began = time.monotonic()
-        optimum = optimise_landing(lander, flight, 0, glide_slope)
+        optimum = optimise_landing(lander, flight, glide_slope)
         row = {"fuel_kg": optimum["fuel_kg"], "final_time_s": optimum["final_time"]}
         row["solve_seconds"] = time.monotonic() - began
         print(f"  {name:<30}{row['fuel_kg']:>16.2f}{row['final_time_s']:>14.2f}{row['solve_seconds']:>15.1f}")

@@ -36,7 +36,7 @@ def played(u):
 def descent():
     """Its one flight, solved by glide slope."""
     flight = draw_flights(POWERED_DESCENT, np.full((1, len(DRAW)), 0.5), 0.0, 2.5, "start")
-    return {slope: optimise_landing(POWERED_DESCENT, flight, 0, slope) for slope in (None, 0.0, 4.0)}
+    return {slope: optimise_landing(POWERED_DESCENT, flight, slope) for slope in (None, 0.0, 4.0)}
 
 
 @pytest.mark.parametrize(
@@ -66,9 +66,9 @@ def test_equal_flights_are_solved_once(monkeypatch):
     """Nothing of this lander is drawn."""
     calls = []
 
-    def counted(lander, flights, k):
-        calls.append(k)
-        return optimise_landing(lander, flights, k)
+    def counted(lander, flight):
+        calls.append(flight)
+        return optimise_landing(lander, flight)
 
     monkeypatch.setattr(optimum, "optimise_landing", counted)
     found = references(DESCENT, rows(3, seed=9))
@@ -138,7 +138,7 @@ def test_the_guess_does_not_matter(monkeypatch):
     found = []
     for share in (0.8, 1.3):
         monkeypatch.setattr(optimum, "DURATIONS", (share,))
-        found.append([optimise_landing(MARS, drawn, k)["fuel_kg"] for k in range(3)])
+        found.append([optimise_landing(MARS, drawn.one(k))["fuel_kg"] for k in range(3)])
     np.testing.assert_allclose(*found, atol=1e-3)
 
 
@@ -159,16 +159,16 @@ def test_processes_change_only_the_time(mars):
 def test_an_optimum_that_is_not_there_is_one_line():
     weak = replace(MARS, greatest_thrust=7000.0)  # 3.5 m/s^2
     with pytest.raises(NoOptimum, match="^landing: IPOPT stopped with [^\n]*$"):
-        optimise_landing(weak, draw_flights(weak, rows(1), 0.0, 2.5, "start"), 0)
+        optimise_landing(weak, draw_flights(weak, rows(1), 0.0, 2.5, "start"))
     brief = replace(MARS, longest=10.0)
     with pytest.raises(NoOptimum, match="^landing: it takes [^\n]* longer than a flight, 10 s$"):
-        optimise_landing(brief, draw_flights(brief, rows(1), 0.0, 2.5, "start"), 0)
+        optimise_landing(brief, draw_flights(brief, rows(1), 0.0, 2.5, "start"))
 
 
 def test_a_solution_that_does_not_land_is_refused(monkeypatch):
     monkeypatch.setattr(optimum, "TOUCHDOWN", np.array([0.0, 0.0, -1e-7, 0.0, 0.0, -0.5]))
     with pytest.raises(NoOptimum, match="^landing: the replay of a solution of [^\n]* m from the pad with 0.5 m/s$"):
-        optimise_landing(MARS, draw_flights(MARS, rows(1), 0.0, 2.5, "start"), 0)
+        optimise_landing(MARS, draw_flights(MARS, rows(1), 0.0, 2.5, "start"))
 
 
 def test_an_unknown_option_is_refused():
