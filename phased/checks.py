@@ -79,7 +79,7 @@ def check_norm(problem):
     norm = problem.u_norm
     if norm is None:
         return
-    possible = is_tuple_of(is_finite, norm) and len(norm) == 2 and 0 <= norm[0] < norm[1]
+    possible = is_tuple_of(is_finite, norm, 2) and 0 <= norm[0] < norm[1]
     refuse(problem, possible, "u_norm", norm, "must be a least and a greatest norm, 0 <= least < greatest")
     refuse(problem, problem.controls > 1, "u_norm", norm, "needs a vector: u_max must be a tuple")
     holds = problem.u_min is None and all(high == norm[1] for high in problem.u_max)
@@ -91,15 +91,14 @@ def check_norm(problem):
 def check_starts(problem, n: int):
     """The box or function of the starts."""
     half, centre = problem.x0_max, problem.x0
-    at_least_0 = lambda value: is_finite(value) and value >= 0  # noqa: E731
-    possible = at_least_0(half) or (is_tuple_of(at_least_0, half) and len(half) == n)
+    possible = is_weight(half) or is_tuple_of(is_weight, half, n)
     refuse(problem, possible, "x0_max", half, f"must be one number of at least 0, or {n}, one for each state")
     if callable(centre):
         refuse(
             problem, problem.scores > 0, "scores", problem.scores, "must be at least 1 where x0 is a function of them"
         )
         return
-    possible = centre is None or (is_tuple_of(is_finite, centre) and len(centre) == n)
+    possible = centre is None or is_tuple_of(is_finite, centre, n)
     refuse(problem, possible, "x0", centre, f"must be {n} finite numbers, one for each state, or a function of z")
     edge = np.abs(np.zeros(n) if centre is None else np.array(centre)) + np.array(half)
     beyond = edge > np.array(problem.x_max)
@@ -110,11 +109,11 @@ def check_starts(problem, n: int):
 def check_rows(problem, n: int, n_states: str):
     """The fields with one entry for each state or control."""
     scale = problem.x_scale
-    possible = scale is None or (is_tuple_of(positive, scale) and len(scale) == n)
+    possible = scale is None or is_tuple_of(positive, scale, n)
     refuse(problem, possible, "x_scale", scale, f"must be {n} positive {n_states}")
     for name, count in (("x_names", n), ("u_names", problem.controls)):
         names = getattr(problem, name)
-        possible = names is None or (is_tuple_of(lambda word: isinstance(word, str), names) and len(names) == count)
+        possible = names is None or is_tuple_of(lambda word: isinstance(word, str), names, count)
         each = "state (x_max" if name == "x_names" else "control (u_max"
         refuse(problem, possible, name, names, f"must be a tuple of words, {count}: one for each {each} has {count})")
     hidden = problem.velocities
@@ -122,7 +121,7 @@ def check_rows(problem, n: int, n_states: str):
     refuse(problem, possible, "velocities", hidden, f"must be a tuple of the states' indices, from 0 to {n - 1}")
     bounds = problem.bounds
     if bounds is not None:
-        possible = is_tuple_of(is_bound, bounds) and len(bounds) == n
+        possible = is_tuple_of(is_bound, bounds, n)
         refuse(problem, possible, "bounds", bounds, f"must be {n} pairs (least, greatest) or None, one for each state")
         refuse(
             problem, positive(problem.bound_price), "bound_price", problem.bound_price, "must be positive with bounds"
@@ -142,24 +141,21 @@ def check_phase(problem, phase, k: int):
     def check(possible, name, allowed):
         refuse(problem, possible, f"{name} of phase {k}", getattr(phase, name), allowed)
 
-    check(
-        isinstance(phase.steps, int | np.integer) and phase.steps >= 1, "steps", "must be a whole number of at least 1"
-    )
-    number_or_none = lambda value: value is None or is_finite(value)  # noqa: E731
+    whole(problem, f"steps of phase {k}", phase.steps, 1)
     target = phase.target
-    possible = target is None or (is_tuple_of(number_or_none, target) and len(target) == n)
+    possible = target is None or is_tuple_of(is_finite_or_none, target, n)
     check(possible, "target", f"must be {n} numbers or None, one for each state (x_max has {n})")
     beyond = any(value is not None and abs(value) > most for value, most in zip(target or (), problem.x_max))
     check(not beyond, "target", f"must be within x_max {problem.x_max}")
     aimed = sum(value is not None for value in problem.targets_of(phase))
     is_radius = lambda value: isinstance(value, int | float) and value > 0  # noqa: E731
-    possible = is_radius(phase.radius) or (is_tuple_of(is_radius, phase.radius) and len(phase.radius) == aimed)
+    possible = is_radius(phase.radius) or is_tuple_of(is_radius, phase.radius, aimed)
     check(possible, "radius", f"must be one positive number, or {aimed}, one for each state with a target")
     check(not phase.has_circle or aimed > 0, "radius", "needs a target")
     for name, count in (("R", m), ("Q", n)):
         value = getattr(phase, name)
         single = name == "R" and is_weight(value)
-        possible = single or (name == "Q" and value is None) or (is_tuple_of(is_weight, value) and len(value) == count)
+        possible = single or (name == "Q" and value is None) or is_tuple_of(is_weight, value, count)
         one = "one number of at least 0, or " if name == "R" else ""
         check(possible, name, f"must be {one}a tuple of {count}, none below 0")
     for name in ("Qf", "bonus"):
@@ -244,9 +240,7 @@ def check_step(problem, phase, x, u, p):
 
 HINTS = (  # a part of an error's message -> its usual cause
     ("truth value", "it decides by a value; it may hold no `if`, `min` or `max` of Python, but NumPy's where, minimum"),
-    ("only length-1", "`math`'s functions take one number; it must use NumPy's, as np.sin"),
-    ("only 0-dimensional", "`math`'s functions take one number; it must use NumPy's, as np.sin"),
-    ("only size-1", "`math`'s functions take one number; it must use NumPy's, as np.sin"),
+    ("to Python scalars", "`math`'s functions take one number; it must use NumPy's, as np.sin"),
     ("broadcast", "arrays of different shapes meet; a matrix product must be written out by components"),
     ("matmul", "arrays of different shapes meet; a matrix product must be written out by components"),
     ("unpack", "its tuples have other lengths; u is one number where u_max is one, and a tuple where it is a tuple"),
@@ -311,17 +305,20 @@ def is_weight(value) -> bool:
     return is_finite(value) and value >= 0
 
 
-def is_tuple_of(kind: Callable, value) -> bool:
-    return isinstance(value, tuple) and all(kind(entry) for entry in value)
+def is_finite_or_none(value) -> bool:
+    return value is None or is_finite(value)
+
+
+def is_tuple_of(kind: Callable, value, count: int | None = None) -> bool:
+    """Whether `value` is a tuple of this kind of entries, `count` of them unless that is None."""
+    return isinstance(value, tuple) and count in (None, len(value)) and all(kind(entry) for entry in value)
 
 
 def is_bound(pair) -> bool:
     """Whether `pair` can be an entry of `bounds`."""
     if pair is None:
         return True
-    if not isinstance(pair, tuple) or len(pair) != 2:
-        return False
-    if not all(end is None or is_finite(end) for end in pair):
+    if not is_tuple_of(is_finite_or_none, pair, 2):
         return False
     low, high = pair
     return low is None or high is None or low < high

@@ -149,8 +149,7 @@ class PhasedVectorEnv(BatchedEnv):
         problem = self.problem
         phases = problem.phases
         self._steps = np.array([phase.steps for phase in phases])
-        targets = [[target or 0.0 for target in problem.targets_of(phase)] for phase in phases]
-        self._target = np.array(targets)  # (phases, n)
+        self._target = np.array([problem.aim_of(phase) for phase in phases])  # (phases, n)
         self._Q = np.array([problem.state_weights(phase) for phase in phases])
         self._R = np.array([problem.control_weights(phase) for phase in phases])
         self._low, self._high = problem.u_box[:, :, None]
@@ -254,14 +253,9 @@ class PhasedVectorEnv(BatchedEnv):
         cost = np.zeros(self.num_envs)
         for k in np.unique(phase):
             there = phase == k
-            after[:, there], cost[there] = self._fly_some(there, phases[k], x, u, h)
+            *_, fly = self._view(there, phases[k], x, u)
+            after[:, there], cost[there] = fly(h)
         return tuple(after), cost
-
-    def _fly_some(self, there, phase: Phase, x, u, h):
-        """`Problem.step` for the environments `there`, a mask or indices."""
-        some = lambda values: tuple(value[there] for value in values)  # noqa: E731
-        u = some(u) if isinstance(u, tuple) else u[there]
-        return self.problem.step(phase, some(x), u, some(self._parameters), h)
 
     def _end_by_event(self, k, phase: Phase, before, u, running, length):
         """The environments (N,) in phase k whose event falls through 0 in this step. Puts them where it does."""
@@ -288,7 +282,7 @@ class PhasedVectorEnv(BatchedEnv):
         return met
 
     def _view(self, there, phase: Phase, before, u):
-        """For the environments `there`: dynamics f(x), states at the step's begin, event(x), and fly(h) as `step`."""
+        """For the environments `there`, a mask or indices: f(x), states at the begin, event(x), fly(h) as `step`."""
         problem = self.problem
         x, p = (tuple(value[there] for value in values) for values in (before, self._parameters))
         u = tuple(value[there] for value in u) if isinstance(u, tuple) else u[there]

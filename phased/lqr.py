@@ -43,9 +43,9 @@ def riccati(problem: Problem):
     P = np.zeros((T + 1, n, n))
     p = np.zeros(n)
     end = T
-    next_target = point_of(problem, problem.phases[-1])
+    next_target = problem.aim_of(problem.phases[-1])
     for phase in reversed(problem.phases):
-        target = point_of(problem, phase)
+        target = problem.aim_of(phase)
         A, B = linearise(problem, target, phase)
         hidden = problem.hidden(np.zeros((1, problem.scores)))
         rest, _ = problem.step(phase, tuple(target[:, None]), problem.as_control(np.zeros((m, 1))), hidden, problem.dt)
@@ -74,11 +74,6 @@ def solved(weight: np.ndarray, right: np.ndarray) -> np.ndarray:
         return np.linalg.pinv(weight) @ right
 
 
-def point_of(problem: Problem, phase: Phase) -> np.ndarray:
-    """A phase's target (n,), with 0 for the states that have none."""
-    return np.array([target or 0.0 for target in problem.targets_of(phase)])
-
-
 def lqr(problem: Problem):
     """The gains K (T, n) of u_t = -K_t x_t, and P (T+1, n, n) of the cost to go x'P_t x, for problems with one control.
 
@@ -93,7 +88,7 @@ def lqr(problem: Problem):
 
 def targets(problem: Problem) -> np.ndarray:
     """The target of each step's phase, (T, n)."""
-    points = [point_of(problem, phase) for phase in problem.phases]
+    points = [problem.aim_of(phase) for phase in problem.phases]
     return np.repeat(points, [phase.steps for phase in problem.phases], axis=0)
 
 

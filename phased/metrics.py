@@ -118,8 +118,7 @@ def cost_parts(problem: Problem, x: np.ndarray, u: np.ndarray) -> np.ndarray:
     parts, start = np.zeros((len(x), 3)), 0
     for phase in problem.phases:
         aimed = np.array([target is not None for target in problem.targets_of(phase)])
-        target = np.array([target or 0.0 for target in problem.targets_of(phase)])
-        d = (x[:, start : start + phase.steps + 1] - target) * aimed
+        d = (x[:, start : start + phase.steps + 1] - problem.aim_of(phase)) * aimed
         parts[:, 0] += (d[:, :-1] ** 2 @ np.array(problem.state_weights(phase))).sum(axis=1)  # before each step
         parts[:, 1] += (u[:, start : start + phase.steps] ** 2 @ np.array(problem.control_weights(phase))).sum(axis=1)
         parts[:, 2] += phase.Qf * (d[:, -1] ** 2).sum(axis=1)

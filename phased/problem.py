@@ -230,6 +230,10 @@ class Problem:
         """The target of each state, None for a free state."""
         return (None,) * self.states if phase.target is None else phase.target
 
+    def aim_of(self, phase: Phase) -> np.ndarray:
+        """The target (n,), with 0 for a free state."""
+        return np.array([target or 0.0 for target in self.targets_of(phase)])
+
     def state_weights(self, phase: Phase) -> tuple[float, ...]:
         """Q of each state, 0 without a target."""
         if phase.target is None or phase.Q is None:
