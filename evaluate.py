@@ -14,7 +14,6 @@ is taken away. Reading order: evaluation, results folders, command line.
 
 from __future__ import annotations
 
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
@@ -28,7 +27,7 @@ from common.curves import evaluated, read_csv, read_curve, write_csv
 from common.errors import BadInput
 from common.evaluations import read_evaluation, read_json, read_metrics, refuse_another_policy
 from common.files import read_npz, write_bytes, write_npz
-from common.policies import script_of
+from common.policies import evaluate_by_script, script_of
 from common.tasks import task_of
 from exports.folders import EPOCH, LAUNCH_LONGITUDE, export, page
 
@@ -86,15 +85,14 @@ def publish(run_dir, folder, ship: bool = False, numbers: bool = False):
                 write_bytes(staged / file, (run_dir / file).read_bytes())
             redraw(staged)
             animate(staged)
-            keep_excerpt(staged / "eval.npz", task_of(metrics["env_id"]))
+            write_npz(staged / "eval.npz", task_of(metrics["env_id"]).kept_arrays(read_npz(staged / "eval.npz")))
         move(staged, folder, last, replaced=of_another_policy(folder) if ships else ())
 
 
 def shorten(run_dir) -> Path:
     """Make RUN_DIR/bfloat16, a run folder whose policy has large weights in bfloat16 and is flown again.
 
-    Raises OSError or BadInput that says what is missing, or ValueError with the script's line if it cannot fly the
-    policy.
+    Raises OSError or BadInput that says what is missing, or with the script's line if it cannot fly the policy.
     """
     run_dir = Path(run_dir)
     args = read_checkpoint(run_dir / "agent.safetensors", {}, flag="")["args"]
@@ -105,26 +103,15 @@ def shorten(run_dir) -> Path:
             write_bytes(staged / path.name, path.read_bytes())
         policy = staged / "agent.safetensors"
         write_bfloat16(run_dir / "agent.safetensors", policy)
-        flags: dict = {"checkpoint": policy, "eval-npz": staged / "eval.npz", "eval-json": staged / "eval.json"}
+        flags: dict = {"eval-npz": staged / "eval.npz", "eval-json": staged / "eval.json"}
         for name in ("dispersion", "failure", "eval_seed", "eval_starts"):
             if name in args:
                 flags[name.replace("_", "-")] = args[name]
         if args.get("navigation_noise"):
             flags["navigation-noise"] = " ".join(str(sigma) for sigma in args["navigation_noise"])
-        command = [sys.executable, script, "--eval-only", "--no-cuda", *(f"--{name}={flags[name]}" for name in flags)]
-        flown = subprocess.run(command, stderr=subprocess.PIPE, text=True)
-        if flown.returncode:
-            raise ValueError(f"{run_dir}: {flown.stderr.strip()}")
+        evaluate_by_script(script, policy, flags)
         move(staged, run_dir / "bfloat16", staged / "eval.json", replaced=())
     return run_dir / "bfloat16"
-
-
-def keep_excerpt(path, task):
-    """Cut an eval.npz to the arrays that a results folder keeps."""
-    arrays = read_npz(path)
-    kept = task.kept_arrays(arrays)
-    if any(kept[key].shape != arrays[key].shape for key in kept):
-        write_npz(path, kept)
 
 
 def of_another_policy(folder) -> list[str]:
@@ -209,7 +196,9 @@ def publish_command(args):
 
 
 def shorten_command(args):
-    print(shorten(args.run_dir))
+    folder = shorten(args.run_dir)
+    print_tables(folder)
+    print(folder)
 
 
 def figures_command(args):
@@ -283,16 +272,21 @@ def parse_args(argv=None):
     """The arguments of a sub-command."""
     parser = OneLineParser(description="Results folders: add a run, redraw figures, print the table.")
     commands = parser.add_subparsers(dest="command", required=True)
+    of_folder = OneLineParser(add_help=False)
+    of_folder.add_argument("folder", type=Path, help="results/<name> or runs/...")
+    from_site = OneLineParser(add_help=False)
+    site = f"of a rocket's launch site, degrees east: default {LAUNCH_LONGITUDE}"
+    from_site.add_argument("--launch-longitude", type=longitude, default=LAUNCH_LONGITUDE, metavar="L", help=site)
     command = commands.add_parser("publish", help="add a run to a results folder")
     command.add_argument("run_dir", type=Path, help="a finished run: runs/...")
     command.add_argument("folder", type=Path, help="results/<name>, made if it does not exist")
     command.add_argument("--ship", action="store_true", help="replace the policy that the folder ships")
     command = commands.add_parser("shorten", help="write a run's policy in bfloat16 into RUN_DIR/bfloat16, and fly it")
     command.add_argument("run_dir", type=Path, help="a run: runs/...")
-    command = commands.add_parser("figures", help="redraw the figures of a results or run folder, print its table")
-    command.add_argument("folder", type=Path, help="results/<name> or runs/...")
-    command = commands.add_parser("animate", help="write figures/animation.gif of a results or run folder")
-    command.add_argument("folder", type=Path, help="results/<name> or runs/...")
+    redrawn = "redraw the figures of a results or run folder, print its table"
+    commands.add_parser("figures", parents=[of_folder], help=redrawn)
+    animated = "write figures/animation.gif of a results or run folder"
+    commands.add_parser("animate", parents=[of_folder], help=animated)
     command = commands.add_parser(
         "opponents", help="classical guidance and other policies on the same dispersed flights"
     )
@@ -313,19 +307,15 @@ def parse_args(argv=None):
     command.add_argument("--eval-seed", type=integer(0, 2**31 - 1), default=0, metavar="S", help="default 0")
     also = "another policy, as often as wanted"
     command.add_argument("--also", type=named_path, action="append", default=[], metavar="NAME=PATH", help=also)
-    command = commands.add_parser("export", help="write the policy, or its flights, for other tools")
-    command.add_argument("folder", type=Path, help="results/<name> or runs/...")
+    exported = "write the policy, or its flights, for other tools"
+    command = commands.add_parser("export", parents=[of_folder, from_site], help=exported)
     for name, help_line in FORMATS.items():
         command.add_argument(f"--{name}", type=output_file, metavar="FILE", help=help_line)
     moment = f"lift-off of --oem and --czml, UTC: default {EPOCH:%Y-%m-%dT%H:%M:%S}"
     command.add_argument("--epoch", type=utc, default=EPOCH, metavar="TIME", help=moment)
-    site = f"of the launch site, degrees east: default {LAUNCH_LONGITUDE}"
-    command.add_argument("--launch-longitude", type=longitude, default=LAUNCH_LONGITUDE, metavar="L", help=site)
-    command = commands.add_parser("page", help="write one HTML file in which the policy flies in a browser")
-    command.add_argument("folder", type=Path, help="results/<name> or runs/...")
+    paged = "write one HTML file in which the policy flies in a browser"
+    command = commands.add_parser("page", parents=[of_folder, from_site], help=paged)
     command.add_argument("--out", type=output_file, metavar="FILE", help="default: page.html in the folder")
-    site = f"of a rocket's launch site, degrees east: default {LAUNCH_LONGITUDE}"
-    command.add_argument("--launch-longitude", type=longitude, default=LAUNCH_LONGITUDE, metavar="L", help=site)
     return parser.parse_args(argv)
 
 

@@ -1,7 +1,7 @@
 """What surrounds the learning in the ppo_gtrxl_*.py scripts.
 
-Reading order: arguments, start of a script, a run with its files and messages, checkpoints, memory, processes. Bad
-input ends a script with one line and exit status 1.
+Reading order: arguments, start of a script, a run with its files and messages, checkpoints, the memory of a process,
+processes. Bad input ends a script with one line and exit status 1.
 """
 
 from __future__ import annotations
@@ -118,7 +118,7 @@ def parse_args(script, argv):
         name, why = unfit
         refuse(name, getattr(args, name, ""), why)
     check_share(args, typed)
-    if args.eval_only and saved and saved["progress"]["seed"] == args.eval_seed:
+    if args.eval_only and saved and saved["counters"]["seed"] == args.eval_seed:
         remark = task.remark_on_seed(args.eval_seed)
         if remark:
             print(remark)
@@ -430,10 +430,7 @@ def load_checkpoint(agent, args, saved):
         if not torch.allclose(constant.cpu(), torch.from_numpy(saved["tensors"][name]), rtol=1e-6):
             print(f"--checkpoint {args.checkpoint}: {args.env_id} has another {name} now; the policy keeps its own")
             break
-    try:
-        agent.load_state_dict({name: torch.from_numpy(array) for name, array in saved["tensors"].items()})
-    except (RuntimeError, TypeError) as error:  # the file can have a number type that torch does not have
-        fail(f"--checkpoint {args.checkpoint}: its weights do not fit its own args ({error})")
+    agent.load_state_dict({name: torch.from_numpy(array) for name, array in saved["tensors"].items()})
     if agent.actor_logstd.requires_grad and not saved["keeps_log_std"]:
         torch.nn.init.constant_(agent.actor_logstd, args.log_std.at(0.0))
     if not args.eval_only:
@@ -484,8 +481,8 @@ class Run:
     - `end_update` counts, saves, evaluates and logs
     - `finish` makes the reported evaluation
 
-    `progress` holds the counters. `training_seconds` is the time of rollouts and updates. `wall_seconds` is all time up
-    to the end of the last update, with the evaluations and saves before it.
+    Of the `counters`, `training_seconds` is the time of rollouts and updates. `wall_seconds` is all time up to the end
+    of the last update, with the evaluations and saves before it.
     """
 
     def __init__(self, args, saved, agent, average, optimizer, envs, env_options, describe):
@@ -502,23 +499,23 @@ class Run:
         self.metrics = {}
         if self.rank > 0:  # all processes have the same weights, but draw other noise
             torch.manual_seed(args.seed + 2**31 * self.rank)
-        self.progress = {"seed": args.seed, "total_updates": 0, "global_step": 0}
-        self.progress |= {"training_seconds": 0.0, "wall_seconds": 0.0}
+        self.counters = {"seed": args.seed, "total_updates": 0, "global_step": 0}
+        self.counters |= {"training_seconds": 0.0, "wall_seconds": 0.0}
         if args.resume is not None:
             self.folder = Path(args.resume)
-            self.progress = restore(saved, self.folder, self.modules, envs)
+            self.counters = restore(saved, self.folder, self.modules, envs)
         elif args.eval_only:
-            self.progress = saved["progress"]
-        self.began = time.time() - self.progress["wall_seconds"]
+            self.counters = saved["counters"]
+        self.began = time.time() - self.counters["wall_seconds"]
         self.update_began = time.time()
 
     @property
     def updates_done(self):
         """The number of updates that are learned and counted."""
-        return self.progress["total_updates"]
+        return self.counters["total_updates"]
 
     def __enter__(self):
-        self.state = training_state(self.args, self.modules, self.envs, self.progress)
+        self.state = training_state(self.args, self.modules, self.envs, self.counters)
         if self.rank > 0:
             return self
         is_new = self.folder is None
@@ -539,7 +536,7 @@ class Run:
         arguments = {**plain_args(self.args), "resume": None}
         if self.args.save_model:
             files.write_json(self.folder / "args.json", arguments)
-        self.writer = new_writer(self.folder, self.progress["global_step"] + 1, arguments)
+        self.writer = new_writer(self.folder, self.counters["global_step"] + 1, arguments)
         self.save()
         self.update_began = time.time()
         return self
@@ -585,17 +582,17 @@ class Run:
         now = time.time()
         steps = int(total(alive.sum()))
         episodes = gathered(episodes)
-        self.progress = {**self.progress, "total_updates": iteration, "wall_seconds": now - self.began}
-        self.progress["global_step"] += steps
-        self.progress["training_seconds"] += now - self.update_began
-        state = training_state(args, self.modules, self.envs, self.progress)
+        self.counters = {**self.counters, "total_updates": iteration, "wall_seconds": now - self.began}
+        self.counters["global_step"] += steps
+        self.counters["training_seconds"] += now - self.update_began
+        state = training_state(args, self.modules, self.envs, self.counters)
         if self.rank == 0:
             if args.eval_every and iteration % args.eval_every == 0:
                 self.metrics, _ = self.evaluate(TRAINING_EVAL_SEED)
                 self.log("eval", self.metrics)
             charts = {"episodic_return": episodes["episodic_return"].mean().item(), "learning_rate": learning_rate}
             charts["episodic_length"] = steps / args.num_envs
-            charts["SPS"] = int(self.progress["global_step"] / self.progress["training_seconds"])
+            charts["SPS"] = int(self.counters["global_step"] / self.counters["training_seconds"])
             self.log("charts", charts)
             self.log("losses", losses)
             if iteration % (args.eval_every or max(1, args.total_updates // 100)) == 0 or iteration == 1:
@@ -607,18 +604,18 @@ class Run:
 
     def print_line(self, episodes):
         """Print how far the run is, what the sampled episodes earned and what the last evaluation found."""
-        done = self.progress["total_updates"]
+        done = self.counters["total_updates"]
         of = self.args.total_updates
         seconds = time.time() - self.began
         clock = f"{seconds / 60:.1f} min gone, {(of - done) * seconds / done / 60:.1f} to go"
-        line = f"update {done}/{of}, {self.progress['global_step']} steps, {clock}"
+        line = f"update {done}/{of}, {self.counters['global_step']} steps, {clock}"
         print(f"{line}: {self.describe(episodes, self.metrics)}", flush=True)
 
     def log(self, prefix, values):
         """Write every number of `values` under its TensorBoard tag."""
         for name, value in values.items():
             if isinstance(value, int | float):
-                self.writer.add_scalar(f"{prefix}/{name}", value, self.progress["global_step"])
+                self.writer.add_scalar(f"{prefix}/{name}", value, self.counters["global_step"])
 
     def evaluate(self, eval_seed):
         """Fly the mean action of the averaged weights, and the optimum. Returns the metrics and arrays of eval.*."""
@@ -626,7 +623,7 @@ class Run:
         policy = average.make_policy(self.longest_episode)
         metrics, arrays = self.task.evaluate(policy, eval_seed, self.flights(eval_seed), **self.env_options)
         device = average.actor_logstd.device.type
-        return {**metrics, **self.progress, "device": device, "torch_version": torch.__version__}, arrays
+        return {**metrics, **self.counters, "device": device, "torch_version": torch.__version__}, arrays
 
     @property
     def longest_episode(self):
@@ -715,17 +712,17 @@ def track(args, name):
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def training_state(args, modules, envs, progress):
+def training_state(args, modules, envs, counters):
     """A copy of all that a bit-exact resume needs. Training does not change the copy."""
     modules = {name: module.state_dict() for name, module in modules.items()}
     rng = {"torch": torch.get_rng_state()}
     rng |= {name: json.dumps(stream.bit_generator.state) for name, stream in envs.generators.items()}
     rng = all_gather({**rng, "cuda": torch.cuda.get_rng_state_all()})
-    return copy.deepcopy({"args": {**plain_args(args), "resume": None}, "progress": progress, "rng": rng, **modules})
+    return copy.deepcopy({"args": {**plain_args(args), "resume": None}, "progress": counters, "rng": rng, **modules})
 
 
 def restore(state, run_dir, modules, envs):
-    """Put everything back where `training_state` found it. Returns the progress.
+    """Put everything back where `training_state` found it. Returns the counters.
 
     Ends with one line if something does not fit.
     """
@@ -787,7 +784,7 @@ def save_run(run_dir, state):
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Memory
+# The memory of a process
 # ---------------------------------------------------------------------------------------------------------------------
 
 

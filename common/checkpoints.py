@@ -31,7 +31,7 @@ def read_checkpoint(
     defaults: dict | None = None,
     flag: str = "--checkpoint ",
 ) -> dict:
-    """An agent.safetensors: `args` (the run's arguments), `progress` (its counters), `tensors` (NumPy arrays).
+    """An agent.safetensors: `args` (the run's arguments), `counters`, `tensors` (NumPy arrays).
 
     - expected: the type of each argument that must be there
     - env_ids: the environments that the file may be of; empty: any
@@ -52,9 +52,9 @@ def read_checkpoint(
         allowed = {name: types_of(kind) for name, kind in expected.items()}
         wrong = [name for name, kinds in allowed.items() if type(args[name]) not in kinds]
         metadata.setdefault("training_seconds", metadata["wall_seconds"])  # an older file has only this time
-        progress = {name: kind(metadata[name]) for name, kind in COUNTERS.items()}
-        if not all(math.isfinite(value) and value >= 0 for value in progress.values()):
-            raise ValueError(f"its counters are {progress}")
+        counters = {name: kind(metadata[name]) for name, kind in COUNTERS.items()}
+        if not all(math.isfinite(value) and value >= 0 for value in counters.values()):
+            raise ValueError(f"its counters are {counters}")
     except BadInput:
         raise
     except OSError as error:
@@ -67,7 +67,7 @@ def read_checkpoint(
         raise BadInput(f"{flag}{path}: its {name} is {args[name]!r}; must be {kinds}")
     if not all(np.isfinite(tensor).all() for tensor in tensors.values()):
         raise BadInput(f"{flag}{path}: holds a NaN or an infinity; its weights must be finite")
-    return {"args": args, "progress": progress, "tensors": tensors}
+    return {"args": args, "counters": counters, "tensors": tensors}
 
 
 def types_of(kind) -> tuple[type, ...]:

@@ -39,7 +39,7 @@ def test_large_weights_become_bfloat16(tmp_path):
     assert torch.equal(written["small"], tensors["small"]) and torch.equal(written["rows"], tensors["rows"])
 
     found = read_checkpoint(target, {})
-    assert found["args"] == {"env_id": "X-v0"} and found["progress"] == counters
+    assert found["args"] == {"env_id": "X-v0"} and found["counters"] == counters
     assert found["tensors"]["large"].dtype == np.float32
     np.testing.assert_array_equal(found["tensors"]["large"], large.to(torch.bfloat16).float().numpy())
     np.testing.assert_array_equal(found["tensors"]["small"], tensors["small"].numpy())
@@ -71,7 +71,7 @@ def test_a_shorter_policy_flies_the_starts_of_its_run(tmp_path, monkeypatch):
     monkeypatch.setattr(evaluate, "read_checkpoint", held_out)
     flown = []
     refused = types.SimpleNamespace(returncode=1, stderr="not flown")
-    monkeypatch.setattr(evaluate.subprocess, "run", lambda command, **streams: flown.extend(command) or refused)
+    monkeypatch.setattr("common.policies.subprocess.run", lambda command, **_: flown.extend(command) or refused)
     with pytest.raises(ValueError, match="not flown"):
         evaluate.shorten(run)
     assert {"--eval-seed=273427", "--eval-starts=7", "--dispersion=1.0", "--failure=0.2"} <= set(flown)
