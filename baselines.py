@@ -163,7 +163,7 @@ def fly_solution(env_id: str, x0, u, cost, draw=None):
     return {**flight, "replay_error": error}
 
 
-def reference(env_id: str, x0, processes: int | None = None, draw=None) -> dict:
+def reference(env_id: str, x0, draw=None) -> dict:
     """The optimum from each start x0 (n, states), flown by the environment: the arrays of `envs.fly`.
 
     draw (n, k) are the standard scores, if the table has any. The optimum knows the hidden parameters. The method is
@@ -174,7 +174,7 @@ def reference(env_id: str, x0, processes: int | None = None, draw=None) -> dict:
     - for costs by weights with circles, `waypoint_reference`
     - for costs by functions with circles, `reference_in_circles`
 
-    Raises ValueError for an unknown id, a bad x0 or number of processes, and NoOptimum if a solve or replay fails.
+    Raises ValueError for an unknown id or a bad x0, and NoOptimum if a solve or replay fails.
     """
     x0 = np.asarray(x0, dtype=np.float64)
     if env_id not in PROBLEMS:
@@ -183,25 +183,23 @@ def reference(env_id: str, x0, processes: int | None = None, draw=None) -> dict:
     n = problem.states
     if x0.ndim != 2 or x0.shape[1] != n or len(x0) == 0 or not np.isfinite(x0).all():
         raise ValueError(f"x0 must be finite, of shape (n, {n}) with n >= 1; got {x0.tolist()!r:.80}")
-    if processes is not None and processes < 1:
-        raise ValueError(f"processes is {processes}; it must be at least 1")
     if env_id == DOUBLE_INTEGRATOR.env_id:
         return fly(env_id, lqr_policy(DOUBLE_INTEGRATOR), x0)
     if not problem.circles_count:
-        u, cost, feasible, _ = optimise(env_id, x0, processes=processes, draw=draw)
+        u, cost, feasible, _ = optimise(env_id, x0, draw=draw)
         refuse_first(~feasible, env_id, x0, NO_FLIGHT)
         return fly_solution(env_id, x0, u, cost, draw)
     if not problem.weighted:
-        return reference_in_circles(env_id, x0, processes, draw)
-    return waypoint_reference(env_id, x0, processes, draw)
+        return reference_in_circles(env_id, x0, draw)
+    return waypoint_reference(env_id, x0, draw)
 
 
-def reference_in_circles(env_id: str, x0, processes: int | None = None, draw=None) -> dict:
+def reference_in_circles(env_id: str, x0, draw) -> dict:
     """The optimum that ends each phase in its circle. Raises NoOptimum if there is none, or if its flight misses.
 
     A learner learns of the circles only by the bonus. So the bonus has to be more than the cost of reaching them.
     """
-    u, cost, feasible, _ = optimise(env_id, x0, in_circles=True, processes=processes, draw=draw)
+    u, cost, feasible, _ = optimise(env_id, x0, in_circles=True, draw=draw)
     refuse_first(~feasible, env_id, x0, NO_FLIGHT)
     flight = fly_solution(env_id, x0, u, cost, draw)
     refuse_first(~flight["hit"].all(axis=1), env_id, x0, "misses its circles")
@@ -215,7 +213,7 @@ def refuse_first(bad: np.ndarray, env_id: str, x0, what: str):
         raise NoOptimum(f"start {start}, x0 = {x0[start].tolist()}, of {env_id} {what}")
 
 
-def waypoint_reference(env_id: str, x0, processes: int | None = None, draw=None) -> dict:
+def waypoint_reference(env_id: str, x0, draw) -> dict:
     """The better of two optima, with and without the constraints |x - target| <= r at every phase's end.
 
     Bonuses count in this comparison. Beside the arrays of `fly_solution` it returns
@@ -228,8 +226,8 @@ def waypoint_reference(env_id: str, x0, processes: int | None = None, draw=None)
 
     Raises NoOptimum if an optimum with the constraints misses a circle in flight.
     """
-    u_free, cost_free, _, _ = optimise(env_id, x0, processes=processes, draw=draw)
-    u, cost, feasible, multipliers = optimise(env_id, x0, in_circles=True, processes=processes, draw=draw)
+    u_free, cost_free, _, _ = optimise(env_id, x0, draw=draw)
+    u, cost, feasible, multipliers = optimise(env_id, x0, in_circles=True, draw=draw)
     free = fly_solution(env_id, x0, u_free, cost_free, draw)
     best_u = np.where(feasible.reshape(-1, *[1] * (u.ndim - 1)), u, u_free)
     circled = fly_solution(env_id, x0, best_u, np.where(feasible, cost, cost_free), draw)

@@ -200,12 +200,12 @@ def test_a_block_without_a_signal_keeps_its_own_errors():
 
 def test_result_does_not_depend_on_the_number_of_processes():
     x0 = starts(12)
-    alone = reference("VanDerPol-v0", x0, processes=1)
-    shared = reference("VanDerPol-v0", x0, processes=2)
-    backwards = reference("VanDerPol-v0", x0[::-1], processes=1)
-    for key, value in alone.items():
-        np.testing.assert_array_equal(shared[key], value)
-        np.testing.assert_array_equal(backwards[key][::-1], value)
+    alone = optimise("VanDerPol-v0", x0, processes=1)
+    shared = optimise("VanDerPol-v0", x0, processes=2)
+    backwards = optimise("VanDerPol-v0", x0[::-1], processes=1)
+    for value, other, mirrored in zip(alone, shared, backwards, strict=True):
+        np.testing.assert_array_equal(other, value)
+        np.testing.assert_array_equal(mirrored[::-1], value)
 
 
 # --- waypoints --------------------------------------------------------------------------------------------------------
@@ -374,7 +374,7 @@ def test_every_problem_has_a_reference_that_is_flown(env_id):
 
 def test_solver_failure_names_the_start():
     with pytest.raises(RuntimeError, match=r"start 1, x0 = \[1000.0, 1000.0\], of VanDerPol-v0: IPOPT stopped with "):
-        reference("VanDerPol-v0", [[0.1, 0.1], [1000.0, 1000.0]], processes=1)
+        reference("VanDerPol-v0", [[0.1, 0.1], [1000.0, 1000.0]])
 
 
 def test_replay_refuses_a_cost_that_is_not_flown():
@@ -390,24 +390,23 @@ def test_replay_refuses_a_cost_that_is_not_flown():
 
 
 def test_optimum_that_misses_its_circle_is_an_error(monkeypatch):
-    def without_circles(env_id, x0, in_circles=False, processes=None, draw=None):
-        return optimise(env_id, x0, processes=processes)
+    def without_circles(env_id, x0, in_circles=False, draw=None):
+        return optimise(env_id, x0)
 
     monkeypatch.setattr(baselines, "optimise", without_circles)
     with pytest.raises(RuntimeError, match="start 0, .* misses its circles"):
         reference("DoubleIntegratorWaypoints-v0", starts(2))
 
 
-@pytest.mark.parametrize("env_id, x0, processes, message", [
-    ("Pendulum-v1", [[0.0, 0.0]], None, "env_id is 'Pendulum-v1'; it must be one of DoubleIntegrator-v0"),
-    ("VanDerPol-v0", [0.0, 0.0], None, r"x0 must be finite, of shape \(n, 2\)"),
-    ("VanDerPol-v0", np.zeros((0, 2)), None, r"x0 must be finite, of shape \(n, 2\)"),
-    ("DoubleIntegrator-v0", [[0.0, np.nan]], None, r"x0 must be finite, of shape \(n, 2\)"),
-    ("VanDerPol-v0", [[0.0, 0.0]], 0, "processes is 0; it must be at least 1"),
+@pytest.mark.parametrize("env_id, x0, message", [
+    ("Pendulum-v1", [[0.0, 0.0]], "env_id is 'Pendulum-v1'; it must be one of DoubleIntegrator-v0"),
+    ("VanDerPol-v0", [0.0, 0.0], r"x0 must be finite, of shape \(n, 2\)"),
+    ("VanDerPol-v0", np.zeros((0, 2)), r"x0 must be finite, of shape \(n, 2\)"),
+    ("DoubleIntegrator-v0", [[0.0, np.nan]], r"x0 must be finite, of shape \(n, 2\)"),
 ])  # fmt: skip
-def test_bad_arguments_are_refused(env_id, x0, processes, message):
+def test_bad_arguments_are_refused(env_id, x0, message):
     with pytest.raises(ValueError, match=message):
-        reference(env_id, x0, processes)
+        reference(env_id, x0)
 
 
 def test_lqr_refuses_waypoints():
