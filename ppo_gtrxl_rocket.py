@@ -177,7 +177,7 @@ DISPERSED = {  # replaces values of the recipe above; training begins with a pol
 FAILING = {  # replaces values of DISPERSED; rare failures are forgotten if training moves the policy far
     "log_std": "0:-4.5 1:-6.5",
 }
-RECIPES = {"RocketAscent-v0": FIXED, "RocketAscentCutoff-v0": CUTOFF, "TwoStageLEO-v0": CUTOFF}
+RECIPES = {env_id: CUTOFF if mission.cutoff else FIXED for env_id, mission in ROCKETS.items()}
 FIRST_POLICY = {  # the policy with which a dispersed training begins, by environment id
     "RocketAscent-v0": "results/rocket_fixed/agent.safetensors",
     "RocketAscentCutoff-v0": "results/rocket_cutoff/agent.safetensors",
@@ -192,13 +192,12 @@ def has_draws(args):
 
 
 def recipe(args, anew=False):
-    """What our recipe changes for the environments of `args`. An id without a recipe takes CUTOFF or FIXED.
+    """What our recipe changes for the environments of `args`.
 
     With draws, training begins with --checkpoint or with the policy that is shipped for the id. `anew` leaves the
     shipped policy out.
     """
-    family = CUTOFF if ROCKETS[args.env_id].cutoff else FIXED
-    changes = RECIPES.get(args.env_id, family)
+    changes = RECIPES[args.env_id]
     if not has_draws(args):
         return changes
 

@@ -90,7 +90,7 @@ class OurCurriculum(BaseCallback):
         training = self.script.curriculum(self.args, progress)
         if hasattr(type(self.args), "mass_weight"):  # the rocket's script
             price = np.interp(progress, [0.25, 0.6, 1.0], [0.0, 1.0, 0.1])
-            training["mass_weight"] = float(self.batch.cutoff * self.args.mass_weight.at(0.0) * price)
+            training["propellant_price"] = float(self.batch.cutoff * self.args.mass_weight.at(0.0) * price)
         training["flights_per_start"] = 1  # the library compares no flights of one start
         self.batch.hand_over(training)  # not at a reset, because its rollouts end in the middle of flights
 

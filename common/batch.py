@@ -59,9 +59,11 @@ class Training:
             refuse_unless(fits, f"training's {each.name}", repr(value), each.metadata["allowed"])
 
 
-def refuse_assignment(env, name: str, training: Training):
-    """Raise AttributeError for an attribute that only a training may hand over, because assigning it does nothing."""
-    if name in vars(training) and not hasattr(env, name):
+def refuse_assignment(env, name: str, batch: BatchedEnv):
+    """Raise AttributeError for an attribute whose assignment would do nothing, or not all that it should."""
+    if name in batch.set_when_made:
+        raise AttributeError(f"{name} of {type(env).__name__} is set when it is made; make another one with {name}=...")
+    if name in vars(batch.training) and not hasattr(env, name):
         handed_over = f"reset(options={{'training': {{{name!r}: ...}}}})"
         raise AttributeError(
             f"{type(env).__name__} has no attribute {name!r}; a training hands it over by {handed_over}"
@@ -107,6 +109,7 @@ class BatchedEnv(VectorEnv):
 
     metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
     training = Training()  # a problem with a kind of its own has it here, with the values that evaluations fly
+    set_when_made: tuple[str, ...] = ()  # the constructor's options that cannot be assigned later
     single_observation_space: Box
     single_action_space: Box
     _start: Callable  # the problem's
@@ -148,7 +151,7 @@ class BatchedEnv(VectorEnv):
 
     def __setattr__(self, name, value):
         if "_was_reset" in self.__dict__:  # it is made whole; options of the constructor may have a training's names
-            refuse_assignment(self, name, self.training)
+            refuse_assignment(self, name, self)
         super().__setattr__(name, value)
 
     @property
@@ -181,11 +184,11 @@ class BatchedEnv(VectorEnv):
         self._was_reset = True
         return self._observe(), {}
 
-    def refuse_options(self, options: dict, known: list[str]):
-        """Raise BadInput if a reset has an option that is not among these."""
+    def refuse_options(self, options: dict, known: list[str], none: str = "there are none"):
+        """Raise BadInput if a reset has an option that is not among these. `none` says why none is known."""
         if options.keys() - set(known):
-            names = " and ".join(map(repr, known))
-            allowed = f"they may be {names}" if len(known) > 1 else f"the only one is {names}"
+            names = " and ".join(map(repr, known)) or none
+            allowed = {0: none, 1: f"the only one is {names}"}.get(len(known), f"they may be {names}")
             raise BadInput(f"reset options are {options!r}; {allowed}")
 
     def rows_of(self, options: dict, name: str, width: int, holds: Callable = np.isfinite, allowed: str = "finite"):
@@ -338,7 +341,7 @@ class SingleEnv(gym.Env):
 
     def __setattr__(self, name, value):
         if name != "batch":
-            refuse_assignment(self, name, self.batch.training)
+            refuse_assignment(self, name, self.batch)
         super().__setattr__(name, value)
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):

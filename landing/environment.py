@@ -89,6 +89,7 @@ class LanderVectorEnv(BatchedEnv):
 
     metadata = {**BatchedEnv.metadata, **RENDERED}
     training = LanderTraining()
+    set_when_made = ("decision_s", "longest_flight")
 
     def __init__(
         self,

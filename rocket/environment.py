@@ -65,7 +65,7 @@ class RocketTraining(Training):
     terminal_scale: float = numeric(TERMINAL_SCALE, low=1e-12)
     guidance: bool = checked(False, lambda value: isinstance(value, bool), "must be True or False")  # pay R_guidance
     # reward lost per `mass_unit` of propellant burnt in the last phase; our script pays `mass_rewards` instead
-    mass_weight: float = numeric(0.0)
+    propellant_price: float = numeric(0.0)
     # "ignition" for a while where the environment's `failure_time` is "random" (None: the environment's)
     failure_time: str | None = checked(
         None,
@@ -129,6 +129,7 @@ class RocketVectorEnv(BatchedEnv):
 
     metadata = {**BatchedEnv.metadata, **RENDERED}
     training = RocketTraining()
+    set_when_made = ("end_time",)
     PARTS = ("R_orbital", "R_trajectory", "R_guidance", "R_penalties", "R_terminal")
 
     def __init__(
@@ -243,11 +244,7 @@ class RocketVectorEnv(BatchedEnv):
 
     def _start(self, mask, options):
         taken = ["draw"] * self.has_draws + ["noise"] * bool(self.navigation_noise)
-        if options.keys() - set(taken):
-            allowed = "a rocket has none without dispersion, failure or navigation noise"
-            if taken:
-                allowed = f"the only one is {taken[0]!r}" if len(taken) == 1 else "they may be 'draw' and 'noise'"
-            raise BadInput(f"reset options are {options!r}; {allowed}")
+        self.refuse_options(options, taken, "a rocket has none without dispersion, failure or navigation noise")
         if self.has_draws:
             self._launch(mask, options.get("draw"))
         if self.navigation_noise:
@@ -444,7 +441,7 @@ class RocketVectorEnv(BatchedEnv):
             pitch = np.radians(np.interp(self.rocket.dt * t, until * np.array(times), angles, right=np.nan))
             parts[2] = guidance_reward(u, *local_frame(before, self._axes[2])[:2], pitch)
         left = np.minimum(self.y[6] - self.vehicles.dry_mass, self.vehicles.propellant)
-        parts[3] = penalties(self.mission, altitude, self.time, turn, burnt, left, self.training.mass_weight)
+        parts[3] = penalties(self.mission, altitude, self.time, turn, burnt, left, self.training.propellant_price)
         self._parts += parts
         if done.any():
             error_norm = np.linalg.norm(terminal_error(self.y[:, done].T, self.rocket), axis=1)

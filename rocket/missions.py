@@ -28,7 +28,7 @@ class Mission:
     floor_km: float = 110.0  # altitude below which a flight is penalised, from `floor_from` on
     floor_from: float = 300.0  # s
     guided_until: float | None = None  # s until which R_guidance has a reference pitch (None: the first burn's end)
-    mass_unit: float | None = None  # kg of propellant that `mass_weight` is the price of (None: 6 % of the dry mass)
+    mass_unit: float | None = None  # kg, what `propellant_price` is the price of (None: 6 % of the dry mass)
 
     def __post_init__(self):
         for name in ("floor_km", "floor_from"):

@@ -36,7 +36,7 @@ def guidance_reward(u, up, along, pitch):
     return np.where(np.isnan(pitch), 0.0, -GUIDANCE_WEIGHT * (1 - cosine))
 
 
-def penalties(mission: Mission, altitude, time, turn, burnt, left, mass_weight):
+def penalties(mission: Mission, altitude, time, turn, burnt, left, propellant_price):
     """R_penalties = -40 c (2 - t / t_end) - 0.024 o - 0.024 s - 0.001 |u_t - u_{t-1}| - w_m (b + c l) / mass_unit.
 
     - c = 1[h < 0] is a crash. It must cost more than the worst miss, and more the earlier it comes. A policy whose
@@ -57,7 +57,7 @@ def penalties(mission: Mission, altitude, time, turn, burnt, left, mass_weight):
     sag = np.minimum(np.maximum((1e3 * mission.floor_km - altitude) / 30e3, 0.0), 1.0) * (time > mission.floor_from)
     mass_unit = mission.mass_unit or 0.06 * mission.rocket.dry_mass
     crashed = -40.0 * crash * (2 - time / mission.rocket.end_time)
-    return crashed - 0.024 * (overshoot + sag) - 0.001 * turn - mass_weight * (burnt + crash * left) / mass_unit
+    return crashed - 0.024 * (overshoot + sag) - 0.001 * turn - propellant_price * (burnt + crash * left) / mass_unit
 
 
 TERMINAL_SCALE = 0.005  # the scale of the reported R_terminal

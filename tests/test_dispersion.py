@@ -469,7 +469,7 @@ def test_a_crash_is_charged_the_flights_own_propellant():
     z = np.zeros((2, 16))
     z[1, DRAW.index("propellant_3")] = 2.0
     batch = make(CUTOFF, 2)
-    batch.reset(options={"draw": z, "training": {"mass_weight": 1.0}})
+    batch.reset(options={"draw": z, "training": {"propellant_price": 1.0}})
     final = batch.step(np.tile([-1.0, 0.0, 0.0], (2, 1)))[4]["final_info"]
     assert final["crashed"].all()
     difference = final["R_penalties"][1] - final["R_penalties"][0]

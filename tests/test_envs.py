@@ -206,6 +206,13 @@ def test_what_a_training_hands_over_is_no_attribute(env_id, name):
             setattr(env, name, 0.5)
 
 
+@pytest.mark.parametrize("env_id, name", [("RocketAscent-v0", "end_time"), ("MarsLanding-v0", "decision_s")])
+def test_what_is_set_when_an_environment_is_made_cannot_be_assigned(env_id, name):
+    for env in (gym.make(env_id).unwrapped, gym.make_vec(env_id, num_envs=2).unwrapped):
+        with pytest.raises(AttributeError, match=f"^{name} of .* make another one with {name}="):
+            setattr(env, name, 0.4)
+
+
 @pytest.mark.parametrize("name, value", [("radius_scale", [1.0, 2.0]), ("radius_scale", "2"), ("bonus_width", -1.0)])
 def test_bad_values_of_a_training_are_refused_at_reset(name, value):
     with pytest.raises(BadInput, match=f"^training's {name} is .*; it must be a number of at least 0"):

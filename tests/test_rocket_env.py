@@ -412,7 +412,7 @@ def test_short_flights_know_no_last_phase(v, end_time, monkeypatch):
     """Neither the mass term nor the cut-off act before the last phase, where the training ends the episode before."""
     monkeypatch.setattr(Rocket, "target_energy", -MU / (2 * 3.3e6))
     envs = make(v.cutoff, action_frame="local", end_time=end_time)
-    *_, final = fly(envs, lambda obs, t: v.programme(2 * t), mass_weight=1.0)
+    *_, final = fly(envs, lambda obs, t: v.programme(2 * t), propellant_price=1.0)
     assert final["final_time_s"] == end_time
     assert final["R_penalties"] > -1
 

@@ -24,7 +24,7 @@ from rocket.rewards import (
 )
 
 
-def expected_parts(v, floor, seen, u, final, mass_weight, knots):
+def expected_parts(v, floor, seen, u, final, propellant_price, knots):
     """The five parts (K, 5) of each step of a flight, from the formulas' words, by a plain loop."""
     parts = np.zeros((len(u), 5))
     for k in range(len(u)):
@@ -43,9 +43,9 @@ def expected_parts(v, floor, seen, u, final, mass_weight, knots):
         if k:
             parts[k, 3] -= 0.001 * np.linalg.norm(u[k] - u[k - 1])
         if begin >= v.last_ignition:
-            parts[k, 3] -= mass_weight * (before[6] - after[6]) / v.mass_unit
+            parts[k, 3] -= propellant_price * (before[6] - after[6]) / v.mass_unit
         if altitude < 0:
-            parts[k, 3] -= mass_weight * min(after[6] - v.dry_mass, v.last_propellant) / v.mass_unit
+            parts[k, 3] -= propellant_price * min(after[6] - v.dry_mass, v.last_propellant) / v.mass_unit
         if k == len(u) - 1:
             parts[k, 4] = -2 * math.log(1 + np.linalg.norm(v.goal_errors(after)) / 0.005)
     return parts
@@ -53,7 +53,7 @@ def expected_parts(v, floor, seen, u, final, mass_weight, knots):
 
 KNOTS = ([0, 10, 40, 75.2, 150.4], [90, 88, 72, 55, 35])
 KNOTS_OF_TWO_STAGES = ([0, 10.77127660, 43.08510638, 81, 162], [90, 88, 72, 55, 35])  # its 162 s for the paper's 150.4
-ALL_WEIGHTS = {"guidance": True, "mass_weight": 0.3}
+ALL_WEIGHTS = {"guidance": True, "propellant_price": 0.3}
 
 
 @pytest.mark.slow
@@ -76,7 +76,7 @@ def test_rewards_follow_the_formulas(env_id, steering, weights, knots):
     seen, rewards, final = fly(envs, steer, **weights)
     u = np.array([np.array(a) / np.linalg.norm(a) @ v.up_along_cross(s) for a, s in zip(actions, seen)])
     floor = 130e3 if env_id == FIXED else 110e3
-    parts = expected_parts(v, floor, seen, u, final, weights.get("mass_weight", 0.0), knots)
+    parts = expected_parts(v, floor, seen, u, final, weights.get("propellant_price", 0.0), knots)
     np.testing.assert_allclose(rewards, parts.sum(axis=1), rtol=1e-10, atol=1e-11)
     got = [final[name] for name in PARTS]
     np.testing.assert_allclose(got, parts.sum(axis=0), rtol=1e-10, atol=1e-10)
@@ -120,7 +120,7 @@ def test_penalties_are_the_missions_by_hand():
 @both
 def test_weights_of_the_single_environment(v):
     returns = {}
-    changes = {"mass_weight": 2.0, "guidance": True}
+    changes = {"propellant_price": 2.0, "guidance": True}
     for name, value in changes.items():
         env = single(v.fixed, action_frame="local", end_time=400.0)
         env.reset(options={"training": {name: value}})
@@ -130,12 +130,12 @@ def test_weights_of_the_single_environment(v):
     envs = make(v.fixed, action_frame="local", end_time=400.0)
     plain = fly(envs, lambda obs, t: v.programme(2 * t))[2]
     burnt = v.last_flow * (400 - (162 if v is TWO_STAGE else 262))  # by steps that begin in the last phase
-    assert returns["mass_weight"]["R_penalties"] - plain["R_penalties"] == pytest.approx(
+    assert returns["propellant_price"]["R_penalties"] - plain["R_penalties"] == pytest.approx(
         -2 * burnt / v.mass_unit, abs=1e-9
     )
     for changed, final in returns.items():
         for part in PARTS:
-            affected = {"mass_weight": "R_penalties", "guidance": "R_guidance"}[changed]
+            affected = {"propellant_price": "R_penalties", "guidance": "R_guidance"}[changed]
             assert (final[part] == plain[part]) == (part != affected), (changed, part)
 
 

@@ -142,7 +142,7 @@ def test_the_benchmark_follows_our_curriculum():
     class Watch(sb3_ppo.OurCurriculum):
         def _on_rollout_start(self):
             super()._on_rollout_start()
-            prices.append((batch.training.mass_weight, batch.training.flights_per_start))
+            prices.append((batch.training.propellant_price, batch.training.flights_per_start))
 
     model.learn(64, callback=Watch(script, args, batch, 64))
     assert prices == [(pytest.approx(price), 1) for price in (0, 0, 3 * 0.25 / 0.35, 3 * (1 - 0.9 * 0.15 / 0.4))]

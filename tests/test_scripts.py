@@ -187,11 +187,10 @@ def test_the_optimiser_is_cleanrls_adam(script, monkeypatch, tmp_path):
     assert (optimizer.defaults["eps"], optimizer.defaults["betas"]) == (1e-5, (0.9, 0.999))
 
 
-def test_an_id_without_a_recipe_takes_its_familys(monkeypatch, capsys):
-    """A vehicle that somebody registers: with cut-off as our cut-off rocket, else as our 961 s one."""
+def test_a_rocket_without_a_policy_is_dispersed_anew(monkeypatch, capsys):
+    """A vehicle that somebody registers."""
     for like in ("RocketAscentCutoff-v0", "RocketAscent-v0"):
-        monkeypatch.setitem(envs.ROCKETS, "Mine-v0", envs.ROCKETS[like])
-        assert ROCKET.recipe(ROCKET.Args(env_id="Mine-v0")) == ROCKET.RECIPES[like]
+        monkeypatch.setitem(ROCKET.RECIPES, "Mine-v0", ROCKET.RECIPES[like])
         anew = ROCKET.recipe(ROCKET.Args(env_id="Mine-v0", dispersion=1.0))
         assert anew == ROCKET.RECIPES[like] | {"num_envs": 64, "flights_per_start": 16}
         assert "no policy of Mine-v0 to begin with, so this training begins anew" in capsys.readouterr().out

@@ -328,7 +328,7 @@ def test_one_burn():
     register_rocket("Single-v0", single_burn(), cutoff=True)
     env = gym.make_vec("Single-v0", num_envs=1, action_frame="local")
     with np.errstate(all="raise", under="ignore"):
-        obs, _ = env.reset(options={"training": {"mass_weight": 1.0, "guidance": True}})
+        obs, _ = env.reset(options={"training": {"propellant_price": 1.0, "guidance": True}})
         assert obs[0, 6] == 40000 and obs[0, 7:].tolist() == [1.0, 0.0]
         obs, reward, *_ = env.step(np.array([[1.0, 0.0, 0.0]]))
         assert obs[0, 7:].tolist() == [1 - 2 / 250, 0.0]
