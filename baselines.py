@@ -231,11 +231,7 @@ def waypoint_reference(env_id: str, x0, draw) -> dict:
     free = fly_solution(env_id, x0, u_free, cost_free, draw)
     best_u = np.where(feasible.reshape(-1, *[1] * (u.ndim - 1)), u, u_free)
     circled = fly_solution(env_id, x0, best_u, np.where(feasible, cost, cost_free), draw)
-    missed = feasible & ~circled["hit"].all(axis=1)
-    if missed.any():
-        start = int(np.argmax(missed))
-        distances = circled["terminal_error"][start].tolist()
-        raise NoOptimum(f"start {start}, x0 = {x0[start].tolist()}, of {env_id} misses its circles: {distances}")
+    refuse_first(feasible & ~circled["hit"].all(axis=1), env_id, x0, "misses its circles")
     constrained = circled["episodic_return"] > free["episodic_return"]
     best = {key: free[key].copy() for key in free}
     for key, values in best.items():

@@ -103,12 +103,10 @@ def shorten(run_dir) -> Path:
             write_bytes(staged / path.name, path.read_bytes())
         policy = staged / "agent.safetensors"
         write_bfloat16(run_dir / "agent.safetensors", policy)
-        flags: dict = {"eval-npz": staged / "eval.npz", "eval-json": staged / "eval.json"}
-        for name in ("dispersion", "failure", "eval_seed", "eval_starts"):
-            if name in args:
-                flags[name.replace("_", "-")] = args[name]
-        if args.get("navigation_noise"):
-            flags["navigation-noise"] = " ".join(str(sigma) for sigma in args["navigation_noise"])
+        flags = {"eval_npz": staged / "eval.npz", "eval_json": staged / "eval.json"}
+        for name in ("dispersion", "failure", "navigation_noise", "eval_seed", "eval_starts"):
+            if args.get(name) is not None:
+                flags[name] = args[name]
         evaluate_by_script(script, policy, flags)
         move(staged, run_dir / "bfloat16", staged / "eval.json", replaced=())
     return run_dir / "bfloat16"

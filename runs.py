@@ -112,7 +112,7 @@ def parse_args(script, argv):
         read_flags(args, ["--help"])  # prints, and ends the script
     check(args, script.ENV_IDS)
     task = task_of(args.env_id)
-    options = options_of(args, script.ENV_OPTIONS)
+    options = {name: getattr(args, name) for name in script.ENV_OPTIONS}
     unfit = task.refusal(not args.eval_only, **options)
     if unfit:
         name, why = unfit
@@ -208,11 +208,6 @@ def path_of_policy(path):
         todo = "train it first, or name a --checkpoint"
         fail(f"the recipe begins with the policy {ROOT / path}, which is not there: {todo}")
     return str(found[0])
-
-
-def options_of(args, env_options):
-    """The keyword arguments of the environments: {name: value} of the `args` that `env_options` names."""
-    return {name: getattr(args, name) for name in env_options}
 
 
 def younger(script):

@@ -27,9 +27,14 @@ def script_of(checkpoint) -> Path:
 
 
 def evaluate_by_script(script: Path, checkpoint, flags: dict):
-    """Run `script --eval-only` on a checkpoint, on the CPU. Raises BadInput with the script's line if it refuses."""
+    """Run `script --eval-only` on a checkpoint, on the CPU. `flags` has fields of its Args.
+
+    Raises BadInput with the script's line if it refuses.
+    """
     command = [sys.executable, str(script), "--eval-only", "--no-cuda", f"--checkpoint={checkpoint}"]
-    command += [f"--{name}={value}" for name, value in flags.items()]
+    for name, value in flags.items():
+        words = " ".join(map(str, value)) if isinstance(value, list | tuple) else value
+        command.append(f"--{name.replace('_', '-')}={words}")
     run_quietly(command, checkpoint)
 
 
@@ -37,7 +42,7 @@ def fly_by_script(script: Path, checkpoint, flags: dict) -> tuple[dict, dict]:
     """What `evaluate_by_script` writes, on one core: (metrics, arrays)."""
     with tempfile.TemporaryDirectory() as folder:
         metrics, arrays = (Path(folder) / name for name in ("eval.json", "eval.npz"))
-        files = {"eval-json": metrics, "eval-npz": arrays, "num-threads": 1}
+        files = {"eval_json": metrics, "eval_npz": arrays, "num_threads": 1}
         evaluate_by_script(script, checkpoint, flags | files)
         with np.load(arrays) as file:
             return json.loads(metrics.read_text()), dict(file)

@@ -79,6 +79,17 @@ class Sheet:
         look = {"colors": style["color"], "linewidths": style["linewidth"] * 0.8, "linestyles": [style["linestyle"]]}
         return ax.add_collection(LineCollection([], zorder=4, **look), autolim=False)
 
+    def add_readings(self, styles: list[dict], rows: str, left: float, top: float, linespacing: float) -> list:
+        """Name the rows of the readings at (left, top), and head a column for each side. Returns the columns' texts."""
+        look = {"fontsize": 8, "va": "top", "linespacing": linespacing}
+        self.figure.text(left, top, rows, **look)
+        readings = []
+        for style, name, right in zip(styles, SIDES.values(), (0.88, 0.985)):
+            look |= {"color": style["color"], "ha": "right"}
+            self.figure.text(right, top + 0.05, name, **{**look, "weight": "bold"})
+            readings.append(self.figure.text(right, top, "", **look))
+        return readings
+
     def fit(self, flights: list[Flight]):
         """Set axes that hold all these flights."""
         raise NotImplementedError

@@ -41,7 +41,9 @@ class DescentSheet(Sheet):
         self.thrust = self.panel((0.765, 0.57, 0.22, 0.345), xlabel="time (s)", ylabel="thrust (kN)")
         self._draw_still()
         self._prepare_flights()
-        self._prepare_readings()
+        self.clock = self.figure.text(0.72, 0.455, "", fontsize=9, weight="bold", va="top", linespacing=1.4)
+        rows = "altitude (m)\nspeed (m/s)\npropellant (kg)"
+        self.readings = self.add_readings(self.styles, rows, 0.72, 0.23, 1.4)
         self.moving = [*sum(self.paths, []), *self.thrusts, *self.rings, *self.flames, *self.bodies]
         self.moving += [self.clock, *self.readings]
 
@@ -70,17 +72,6 @@ class DescentSheet(Sheet):
             flame.set_clip_path(Rectangle((-1e6, 0), 2e6, 1e6, transform=ax.transData))  # above ground
         hull = {"facecolor": self.styles[0]["color"], "linewidth": 0, "zorder": 8}
         self.bodies = [ax.add_patch(Polygon(BODY, **hull)) for ax in self.views]
-
-    def _prepare_readings(self):
-        """Below the thrust: the clock with what has happened, and of each side what its instruments show."""
-        self.clock = self.figure.text(0.72, 0.455, "", fontsize=9, weight="bold", va="top", linespacing=1.4)
-        look = {"fontsize": 8, "va": "top", "linespacing": 1.4}
-        self.figure.text(0.72, 0.23, "altitude (m)\nspeed (m/s)\npropellant (kg)", **look)
-        self.readings = []
-        for style, name, right in zip(self.styles, SIDES.values(), (0.88, 0.985)):
-            look |= {"color": style["color"], "ha": "right"}
-            self.figure.text(right, 0.28, name, **{**look, "weight": "bold"})
-            self.readings.append(self.figure.text(right, 0.23, "", **look))
 
     def fit(self, flights: list[Flight]):
         """Axes that hold all these flights and the box of the starts: of one scale, so that directions are true."""

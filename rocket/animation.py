@@ -43,7 +43,9 @@ class AscentSheet(Sheet):
         self._draw_target_altitude()
         self._prepare_lines()
         self._prepare_events()
-        self._prepare_readings()
+        self.clock = self.figure.text(0.635, 0.275, "", fontsize=9, weight="bold")
+        rows = "altitude (km)\nspeed (km/s)\nmass (t)\nperigee (km)\napogee (km)"
+        self.readings = self.add_readings(self.styles, rows, 0.635, 0.215, 1.35)
         self.moving = [*self.paths, *self.pitches, *self.orbits, *self.dots, self.flame, self.body, self.marks]
         self.moving += [*self.labels, self.clock, *self.readings]
         self.moving += [self.failed, self.cross] if self.strike else []
@@ -109,18 +111,6 @@ class AscentSheet(Sheet):
             side = "left" if time <= self.rocket.end_time / 2 else "right"  # text towards the middle stays inside
             self.failed = self.pitch.text(time, 78, f" {text} ", ha=side, color=FAILURE, fontsize=8, weight="bold")
             self.cross = self.ascent.plot([], [], "X", color=FAILURE, markersize=8, zorder=9)[0]
-
-    def _prepare_readings(self):
-        """Prepare the readings below the orbit: the clock, and each side's altitude, speed, mass and apsides."""
-        self.clock = self.figure.text(0.635, 0.275, "", fontsize=9, weight="bold")
-        rows = "altitude (km)\nspeed (km/s)\nmass (t)\nperigee (km)\napogee (km)"
-        look = {"fontsize": 8, "va": "top", "linespacing": 1.35}
-        self.figure.text(0.635, 0.215, rows, **look)
-        self.readings = []
-        for style, name, right in zip(self.styles, SIDES.values(), (0.88, 0.985)):
-            look |= {"color": style["color"], "ha": "right"}
-            self.figure.text(right, 0.265, name, **{**look, "weight": "bold"})
-            self.readings.append(self.figure.text(right, 0.215, "", **look))
 
     def _polar(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Angle from the target's perigee (rad, without jumps) and altitude (m) of states y (n, 7), (n,) each."""

@@ -70,19 +70,13 @@ def knowledge(args: dict) -> str:
     return knows + (", the draw itself" if args.get("observe_draw") else "")
 
 
-def flag_words(value) -> str:
-    """An option of the environment as its flag takes it."""
-    return " ".join(str(part) for part in value) if isinstance(value, tuple) else str(value)
-
-
 def fly_checkpoint(path, dispersion: float, eval_seed: int, n: int, **options):
     """A policy on the first n draws of a seed: the arrays of `evaluate_dispersed`, and {`knows`, `decision_us`}.
 
     Raises BadInput with the script's own line if the script refuses the policy.
     """
     args = read_checkpoint(path, {}, flag="")["args"]
-    flags = {"dispersion": dispersion, "eval-starts": n, "eval-seed": eval_seed}
-    flags |= {name.replace("_", "-"): flag_words(value) for name, value in options.items()}
+    flags = {"dispersion": dispersion, "eval_starts": n, "eval_seed": eval_seed, **options}
     metrics, arrays = fly_by_script(POLICY_SCRIPT, path, flags)
     names = ("draw", "final_y", "final_t", "final_error", "failure")
     ends = {key: arrays[key] for key in names if key in arrays}
