@@ -95,7 +95,7 @@ def shorten(run_dir) -> Path:
     Raises OSError or BadInput that says what is missing, or with the script's line if it cannot fly the policy.
     """
     run_dir = Path(run_dir)
-    args = read_checkpoint(run_dir / "agent.safetensors", {}, flag="")["args"]
+    args = read_checkpoint(run_dir / "agent.safetensors")["args"]
     script = script_of(run_dir / "agent.safetensors")
     with tempfile.TemporaryDirectory() as name:
         staged = Path(name)

@@ -227,7 +227,8 @@ def read_policy(path, script):
     """
     names = ["env_id", *facts(script.Args, Policy)]
     kinds = get_type_hints(script.Args)
-    saved = read_checkpoint(path, {name: kinds[name] for name in names}, script.ENV_IDS, younger(script))
+    expected = {name: kinds[name] for name in names}
+    saved = read_checkpoint(path, expected, script.ENV_IDS, younger(script), "--checkpoint ")
     return saved, {name: saved["args"][name] for name in names}
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from drawing.animation import Animation, Flight
-from drawing.style import POLICY
+from drawing.style import POLICY, SHOWN
 from drawing.time_plots import TimePlots, plot_flight, time_panels
 from drawing.training import cut_outliers, plot_seeds
 
@@ -27,10 +27,10 @@ def training_figure(curves: list[dict], title: str) -> Figure:
     return figure
 
 
-def episodes_of(arrays: dict, shown: int) -> list[Flight]:
+def episodes_of(arrays: dict) -> list[Flight]:
     """The first episodes, each up to its end."""
     flights = []
-    for obs, u in zip(arrays["obs"][:shown], arrays["u"][:shown]):
+    for obs, u in zip(arrays["obs"][:SHOWN], arrays["u"][:SHOWN]):
         steps = int(np.isfinite(u).all(axis=1).sum())
         flights.append(Flight.of(arrays["t"][: steps + 1], u[:steps], obs[: steps + 1], "policy"))
     return flights
@@ -43,9 +43,9 @@ def labels_of(arrays: dict) -> list[str]:
     return [*(f"observation {k}" for k in range(observations)), *(f"action {k}" for k in range(actions))]
 
 
-def episodes_figure(arrays: dict, title: str, shown: int) -> Figure:
+def episodes_figure(arrays: dict, title: str) -> Figure:
     """Each observation and each action of the first episodes over time."""
-    flights = episodes_of(arrays, shown)
+    flights = episodes_of(arrays)
     figure, panels = time_panels(labels_of(arrays), row_height=2.6, rest=0.6)
     for flight in flights:
         plot_flight(panels, flight, POLICY)
@@ -53,7 +53,7 @@ def episodes_figure(arrays: dict, title: str, shown: int) -> Figure:
     return figure
 
 
-def episodes_animation(arrays: dict, title: str, shown: int) -> Animation:
+def episodes_animation(arrays: dict, title: str) -> Animation:
     """The first episodes as they go."""
     sheet = TimePlots(title, labels_of(arrays), arrays["obs"].shape[2], float(arrays["t"][-1]))
-    return Animation.of(sheet, [episodes_of(arrays, shown)])
+    return Animation.of(sheet, [episodes_of(arrays)])

@@ -11,8 +11,6 @@ from common.errors import BadInput
 from common.flying import fly_until_ended
 from common.tasks import SampledTask
 
-SHOWN_FLIGHTS = 10  # in a figure
-
 
 @dataclass(frozen=True)
 class BatchedTask(SampledTask):
@@ -86,13 +84,13 @@ class BatchedTask(SampledTask):
         from batched.figures import episodes_figure, training_figure
 
         figures = {"training.png": training_figure(curves, self.headline(metrics))} if curves else {}
-        figures["episodes.png"] = episodes_figure(arrays, self.headline(metrics), SHOWN_FLIGHTS)
+        figures["episodes.png"] = episodes_figure(arrays, self.headline(metrics))
         return figures
 
     def animation(self, arrays: dict, metrics: dict):
         from batched.figures import episodes_animation
 
-        return episodes_animation(arrays, self.headline(metrics), SHOWN_FLIGHTS)
+        return episodes_animation(arrays, self.headline(metrics))
 
     # --- files
 

@@ -554,7 +554,7 @@ def ppo_runs(row: Row) -> list[dict]:
 
 def ppo_flights(folder: Path, run: dict) -> int:
     """The flights of a training of a results folder: all its seeds have the arguments of the shipped one."""
-    return run["total_updates"] * read_checkpoint(folder / "agent.safetensors", {}, flag="")["args"]["num_envs"]
+    return run["total_updates"] * read_checkpoint(folder / "agent.safetensors")["args"]["num_envs"]
 
 
 def table(folder: Path) -> list[list[str]]:

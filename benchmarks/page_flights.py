@@ -55,7 +55,7 @@ class Engine:
 def page_of(folder: Path) -> str:
     """The page of a results or run folder."""
     metrics, arrays = read_evaluation(folder)
-    checkpoint = read_checkpoint(folder / "agent.safetensors", {})
+    checkpoint = read_checkpoint(folder / "agent.safetensors")
     return html_bytes(offer(task_of(metrics["env_id"]), "page")(metrics, arrays, checkpoint, LAUNCH_LONGITUDE)).decode()
 
 

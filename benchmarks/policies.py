@@ -27,7 +27,7 @@ def environment_options(script, args):
 
 def load(checkpoint):
     """The agent of an agent.safetensors, its script's arguments, and the options of its environments."""
-    env_id = read_checkpoint(checkpoint, {})["args"]["env_id"]
+    env_id = read_checkpoint(checkpoint)["args"]["env_id"]
     script = script_of(env_id)
     refuse_unless(script, f"env_id of {checkpoint}", env_id, "must be one that a script trains")
     argv = ["--eval-only", "--checkpoint", str(checkpoint)]

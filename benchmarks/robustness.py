@@ -83,7 +83,7 @@ def finish(folder, *argv):
     (run,) = (folder / "runs").iterdir()
     assert not list(run.glob(".*.tmp")), f"{run} holds what a killed writer left"
     state = torch.load(run / "training_state.pt", weights_only=True)
-    weights = read_checkpoint(run / "agent.safetensors", {})["tensors"]
+    weights = read_checkpoint(run / "agent.safetensors")["tensors"]
     trained = {name: state[name] for name in ("agent", "average", "optimizer", "rng")}
     return json.loads(json.dumps([trained, weights], default=lambda array: array.tolist()))  # comparable
 

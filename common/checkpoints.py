@@ -10,7 +10,7 @@ import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from types import UnionType
+from types import MappingProxyType, UnionType
 from typing import get_args
 
 import numpy as np
@@ -26,10 +26,10 @@ COUNTERS = {"seed": int, "total_updates": int, "global_step": int, "training_sec
 
 def read_checkpoint(
     path,
-    expected: Mapping[str, type | UnionType],
+    expected: Mapping[str, type | UnionType] = MappingProxyType({}),
     env_ids=(),
-    defaults: dict | None = None,
-    flag: str = "--checkpoint ",
+    defaults: Mapping = MappingProxyType({}),
+    flag: str = "",
 ) -> dict:
     """An agent.safetensors: `args` (the run's arguments), `counters`, `tensors` (NumPy arrays).
 
@@ -44,7 +44,7 @@ def read_checkpoint(
         data = Path(path).read_bytes()
         tensors = read_tensors(data)
         metadata = read_metadata(data)
-        args = {**(defaults or {}), **json.loads(metadata["args"])}
+        args = {**defaults, **json.loads(metadata["args"])}
         env_id = args["env_id"]
         # this check comes first, because another script's file has other arguments, too
         if env_ids and isinstance(env_id, str) and env_id not in env_ids:

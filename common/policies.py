@@ -19,7 +19,7 @@ ROOT = Path(__file__).parents[1]
 
 def script_of(checkpoint) -> Path:
     """The script that trained an agent.safetensors. Raises BadInput if the file is bad or names no script."""
-    name = read_checkpoint(checkpoint, {"exp_name": str}, flag="")["args"]["exp_name"]
+    name = read_checkpoint(checkpoint, {"exp_name": str})["args"]["exp_name"]
     scripts = {path.stem: path for path in ROOT.glob("ppo_gtrxl_*.py")}
     allowed = f"must be that of a script, which flies it: {', '.join(sorted(scripts))}"
     refuse_unless(name in scripts, f"the exp_name of {checkpoint}", repr(name), allowed)
@@ -58,7 +58,7 @@ def competitors(env_id: str, folder: Path, also, taken) -> dict[str, Path]:
         refuse_unless(name not in {*checkpoints, *taken}, "the NAME of --also", name, "must be that of no other row")
         checkpoints[name] = path
     for path in checkpoints.values():
-        other = read_checkpoint(path, {}, flag="")["args"]["env_id"]
+        other = read_checkpoint(path)["args"]["env_id"]
         refuse_unless(other == env_id, f"the env_id of {path}", other, f"must be {env_id}, as that of {folder}")
     refuse_unless(os.access(folder, os.W_OK), "the folder", folder, "must be writable")
     return checkpoints

@@ -59,7 +59,7 @@ def page(folder, target=None, launch_longitude: float = LAUNCH_LONGITUDE) -> Pat
     target = Path(target or folder / "page.html")
     metrics, arrays = read_evaluation(folder)
     refuse_another_policy(folder, metrics)
-    checkpoint = read_checkpoint(folder / "agent.safetensors", {"num_heads": int, "memory_length": int}, flag="")
+    checkpoint = read_checkpoint(folder / "agent.safetensors", {"num_heads": int, "memory_length": int})
     made = offer(task_of(metrics["env_id"]), "page")(metrics, arrays, checkpoint, launch_longitude)
     write_bytes(target, html_bytes(made))
     return target

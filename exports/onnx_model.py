@@ -15,7 +15,6 @@ import json
 import logging
 import sys
 import warnings
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -113,10 +112,10 @@ def load(script, checkpoint):
 
     Raises BadInput if the file is damaged.
     """
-    defaults = {field.name: getattr(script.Args, field.name) for field in fields(script.Args)}
+    defaults = vars(script.Args())
     sizes = ("num_blocks", "embed_dim", "num_heads", "memory_length", "mlp_dim", "hidden_dim")
     kinds = {name: type(defaults[name]) for name in ("env_id", *sizes)}
-    saved = read_checkpoint(checkpoint, kinds, script.ENV_IDS, defaults, flag="")
+    saved = read_checkpoint(checkpoint, kinds, script.ENV_IDS, defaults)
     args = script.Args(**{name: saved["args"][name] for name in defaults})
     options = {name: getattr(args, name) for name in script.ENV_OPTIONS} | script.FIXED_OPTIONS
     envs = make_batch(args.env_id, 1, **options)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from common.tables import lines_of
 from landing.rewards import POSITION_LIMIT, SLOPE_LIMIT, SPEED_LIMIT
 
 CONDITION = f"landed (within {POSITION_LIMIT:g} m and {SPEED_LIMIT:g} m/s, steeper than {SLOPE_LIMIT:g} : 1)"
@@ -26,9 +27,8 @@ def table(metrics: dict) -> str:
     for label, key, digits in ROWS:
         optimum = metrics.get(f"reference_{key}")
         rows.append((label, "-" if optimum is None else f"{optimum:{digits}}", f"{metrics[key]:{digits}}"))
-    width = max(len(label) for label, *_ in rows)
     lines = [f"{metrics['env_id']}: {metrics['eval_starts']} draws of eval seed {metrics['eval_seed']}"]
-    lines += [f"  {label:<{width}}" + "".join(f" {cell:>11}" for cell in cells) for label, *cells in rows]
+    lines += lines_of(rows)
     lines.append(
         f"  The optimum knows mass, gravity and failure; it is of the first {metrics['reference_starts']} draws."
     )

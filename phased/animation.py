@@ -15,8 +15,8 @@ from phased.problem import Problem
 class PhasePlane(Sheet):
     """The phase plane with the circles, and beside it position and control over time, for any number of flights."""
 
-    def __init__(self, problem: Problem, title: str = "", compared: bool = False):
-        super().__init__(title or problem.env_id)
+    def __init__(self, problem: Problem, title: str, compared: bool):
+        super().__init__(title)
         self.problem = problem
         self.styles = [POLICY, OPTIMUM] if compared else [POLICY]
         position, velocity = problem.state_labels
@@ -97,7 +97,7 @@ def widened(low: float, high: float) -> tuple[float, float]:
     return low - margin, high + margin
 
 
-def time_plots(problem: Problem, title: str = "", compared: bool = False) -> TimePlots:
+def time_plots(problem: Problem, title: str, compared: bool) -> TimePlots:
     """Each state and each control over time, with the table's targets and bounds."""
 
     def mark(panels):
@@ -106,13 +106,13 @@ def time_plots(problem: Problem, title: str = "", compared: bool = False) -> Tim
 
     labels = [*problem.state_labels, *problem.control_labels]
     horizon = problem.steps * problem.dt
-    return TimePlots(title or problem.env_id, labels, problem.states, horizon, compared, mark)
+    return TimePlots(title, labels, problem.states, horizon, compared, mark)
 
 
 def sheet_of(problem: Problem, title: str = "", compared: bool = False) -> Sheet:
     """The sheet that a problem is drawn on."""
     is_plane = problem.states == 2 and problem.controls == 1 and not problem.has_events
-    return (PhasePlane if is_plane else time_plots)(problem, title, compared)
+    return (PhasePlane if is_plane else time_plots)(problem, title or problem.env_id, compared)
 
 
 def problem_animation(problem: Problem, arrays: dict, title: str) -> Animation:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from common.tables import lines_of
 from phased.metrics import NEAR_ORIGIN, PAPER_SAMPLES, ends_at_origin
 from phased.problem import Problem
 
@@ -12,13 +13,9 @@ def table(problem: Problem, metrics: dict) -> str:
     If some starts miss a circle, the ratio of J is over the other starts, and the parts of J have no ratio.
     """
     rows = [("", "optimum", "ours", "ratio"), *cost_rows(problem, metrics), *hit_rows(problem, metrics)]
-    width = max(len(label) for label, *_ in rows)
     starts = f"{metrics['eval_starts']} starts of eval seed {metrics['eval_seed']}"
-    lines = [f"{metrics['env_id']}: {'its one start' if problem.has_one_flight else starts}"]
-    for label, *cells in rows:
-        line = f"  {label:<{width}}" + "".join(f" {cell:>11}" for cell in cells)
-        lines.append(line.rstrip())
-    return "\n".join([*lines, *ratio_lines(problem, metrics)])
+    title = f"{metrics['env_id']}: {'its one start' if problem.has_one_flight else starts}"
+    return "\n".join([title, *lines_of(rows), *ratio_lines(problem, metrics)])
 
 
 def cost_rows(problem: Problem, metrics: dict) -> list[tuple]:

@@ -75,7 +75,7 @@ def fly_checkpoint(path, dispersion: float, eval_seed: int, n: int, **options):
 
     Raises BadInput with the script's own line if the script refuses the policy.
     """
-    args = read_checkpoint(path, {}, flag="")["args"]
+    args = read_checkpoint(path)["args"]
     flags = {"dispersion": dispersion, "eval_starts": n, "eval_seed": eval_seed, **options}
     metrics, arrays = fly_by_script(POLICY_SCRIPT, path, flags)
     names = ("draw", "final_y", "final_t", "final_error", "failure")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from common.tables import lines_of
 from rocket.environment import RocketVectorEnv
 from rocket.failure import WHEN
 from rocket.metrics import BOX, ELEMENT_ERRORS, EQUATORIAL, SUCCESS, lowest_key, target_summary, wrapped
@@ -26,11 +27,9 @@ def table(metrics: dict, mission: Mission) -> str:
     optimum_succeeds = metrics["reference_error_norm"] < SUCCESS
     success = ["yes" if hit else "no" for hit in (optimum_succeeds, metrics["success"])]
     rows.append(("success", "-", *success, "crashed" if metrics["crashed"] else "-"))
-    width = max(len(label) for label, *_ in rows)
-    lines = [f"{metrics['env_id']}: difference from the target, or where there is none from the optimum"]
-    for label, *numbers in rows:
-        lines.append(f"  {label:<{width}}" + "".join(f" {cell:>11}" for cell in numbers))
-    return "\n".join([*lines, *remarks(metrics, mission), *dispersed_lines(metrics), *failure_lines(metrics)])
+    title = f"{metrics['env_id']}: difference from the target, or where there is none from the optimum"
+    below = [*remarks(metrics, mission), *dispersed_lines(metrics), *failure_lines(metrics)]
+    return "\n".join([title, *lines_of(rows), *below])
 
 
 def cells(key: str, digits: int, target: float | None, optimum: float | None, ours: float | None) -> list[str]:

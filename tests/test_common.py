@@ -38,7 +38,7 @@ def test_large_weights_become_bfloat16(tmp_path):
     assert torch.equal(written["large"].view(torch.int16), large.to(torch.bfloat16).view(torch.int16))
     assert torch.equal(written["small"], tensors["small"]) and torch.equal(written["rows"], tensors["rows"])
 
-    found = read_checkpoint(target, {})
+    found = read_checkpoint(target)
     assert found["args"] == {"env_id": "X-v0"} and found["counters"] == counters
     assert found["tensors"]["large"].dtype == np.float32
     np.testing.assert_array_equal(found["tensors"]["large"], large.to(torch.bfloat16).float().numpy())

@@ -48,7 +48,7 @@ def rockets(n, env_id=CUTOFF, **options):
 def shipped(env):
     """The policy of the nominal flight, which has a memory."""
     path = ROOT / "results" / "rocket_cutoff" / "agent.safetensors"
-    args = ppo_gtrxl_rocket.Args(**read_checkpoint(path, {}, flag="")["args"])
+    args = ppo_gtrxl_rocket.Args(**read_checkpoint(path)["args"])
     agent = ppo_gtrxl_rocket.Agent(args, env)
     agent.load_state_dict(safetensors.torch.load_file(path))
     return agent.double()

@@ -195,7 +195,7 @@ def test_random_policies_of_rockets(changes, tmp_path):
         args.env_id, "rocket_fixed"
     )
     metrics, arrays = read_evaluation(ROOT / "results" / result)
-    checkpoint = read_checkpoint(tmp_path / "agent.safetensors", {})
+    checkpoint = read_checkpoint(tmp_path / "agent.safetensors")
     engine = Engine(page.html_bytes(offer(task_of(args.env_id), "page")(metrics, arrays, checkpoint, 0.0)).decode())
     flight = engine(f"flyAll(data, {json.dumps(CHANGES)}).policy")
     z, dispersed = draw_of(ROCKETS[args.env_id].rocket, CHANGES), {**options, "dispersion": 1.0}
@@ -273,7 +273,7 @@ def test_random_policies_of_small_problems(script, changes, tmp_path):
     agent, args, options = save(script, tmp_path, **changes)
     x0 = np.random.default_rng(0).uniform(-1, 1, (2, 2))
     flown = fly(args.env_id, copy.deepcopy(agent).double().make_policy(200), x0, **options)
-    checkpoint = read_checkpoint(tmp_path / "agent.safetensors", {})
+    checkpoint = read_checkpoint(tmp_path / "agent.safetensors")
     made = offer(task_of(args.env_id), "page")({}, {"x": flown["x"]}, checkpoint, 0.0)
     engine = Engine(page.html_bytes(made).decode())
     flights = engine("data.starts.map(x => flyPlane(data.problem, x, planePolicy(data.policy, data.problem)))")
@@ -351,7 +351,7 @@ def test_a_table_with_more_than_a_page_flies_is_one_line(new_problem):
 
 def test_a_policy_with_other_features_is_one_line(tmp_path):
     save(ppo_gtrxl_di, tmp_path)
-    checkpoint = read_checkpoint(tmp_path / "agent.safetensors", {})
+    checkpoint = read_checkpoint(tmp_path / "agent.safetensors")
     checkpoint["tensors"]["encoder.0.weight"] = np.zeros((8, 5), dtype=np.float32)
     with pytest.raises(BadInput, match="^the policy's number of features is 5; it must be 3 to fly in a page"):
         offer(task_of("DoubleIntegrator-v0"), "page")({}, {"x": np.zeros((1, 2, 2))}, checkpoint, 0.0)
