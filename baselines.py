@@ -143,6 +143,11 @@ def optimise(
 # ---------------------------------------------------------------------------------------------------------------------
 
 
+def fly_controls(env_id: str, x0, u, draw=None) -> dict:
+    """Fly the controls u (n, T) or (n, T, m) from x0 (n, states): what `envs.fly` returns."""
+    return fly(env_id, lambda obs, t: u[:, t].reshape(len(u), -1), x0, draw)
+
+
 def fly_solution(env_id: str, x0, u, cost, draw=None):
     """Fly the controls u (n, T) or (n, T, m) from x0 (n, states): what `envs.fly` returns, and `replay_error` (n,).
 
@@ -150,7 +155,7 @@ def fly_solution(env_id: str, x0, u, cost, draw=None):
     `REPLAY_TOLERANCE` (with events `REPLAY_TOLERANCE_OF_EVENTS`) the program is not the environment's problem. Then
     NoOptimum is raised, which names the start.
     """
-    flight = fly(env_id, lambda obs, t: u[:, t].reshape(len(u), -1), x0, draw)
+    flight = fly_controls(env_id, x0, u, draw)
     # a cost below 1e-4 (a start within 0.003 of the origin) is compared absolutely, because of IPOPT's own tolerance
     error = np.abs(cost - flight["cost"]) / np.maximum(np.abs(flight["cost"]), 1e-4)
     worst = int(np.argmax(error))
@@ -275,8 +280,7 @@ def compare_double_integrator(env_id: str, x0, flight: dict) -> dict:
     K, P = lqr(PROBLEMS[env_id])
     unbounded = np.einsum("ni,ij,nj->n", x0, P[0], x0)
     saturated = (np.abs(np.einsum("tj,ntj->nt", K, flight["x"][:, :-1])) > PROBLEMS[env_id].u_max).any(axis=1)
-    u_qp = box_qp(PROBLEMS[env_id], x0)
-    qp = fly(env_id, lambda obs, t: u_qp[:, t, None], x0)
+    qp = fly_controls(env_id, x0, box_qp(PROBLEMS[env_id], x0))
     ratio = flight["cost"] / unbounded
     numbers = {"K0_1": K[0, 0], "K0_2": K[0, 1], "P0_11": P[0, 0, 0], "P0_12": P[0, 0, 1], "P0_22": P[0, 1, 1]}
     numbers |= {"expected_cost_unbounded": np.trace(P[0]) / 3, "saturated_share": saturated.mean()}
@@ -287,7 +291,7 @@ def compare_double_integrator(env_id: str, x0, flight: dict) -> dict:
 def compare_single_phase(env_id: str, x0, flight: dict) -> dict:
     """The paper's other references: direct collocation (as solved, and flown) and LQR about the target."""
     u, cost, _, _ = optimise(env_id, x0, hermite_simpson)
-    collocated = fly(env_id, lambda obs, t: u[:, t].reshape(len(u), -1), x0)["cost"]
+    collocated = fly_controls(env_id, x0, u)["cost"]
     linear = fly(env_id, lqr_policy(PROBLEMS[env_id]), x0)["cost"]
     numbers = {}
     for name, other in (("collocation", cost), ("collocation_flown", collocated), ("lqr", linear)):
