@@ -22,7 +22,7 @@ import numpy as np
 
 import envs  # noqa: F401 - makes every id known to `task_of`
 from common.checkpoints import read_checkpoint, write_bfloat16
-from common.command_line import OneLineParser, integer, longitude, named_path, number, output_file, positive, utc
+from common.command_line import OneLineParser, integer, named_path, number, output_file, positive, utc
 from common.curves import evaluated, read_csv, read_curve, write_csv
 from common.errors import BadInput
 from common.evaluations import read_evaluation, read_json, read_metrics, refuse_another_policy
@@ -274,7 +274,9 @@ def parse_args(argv=None):
     of_folder.add_argument("folder", type=Path, help="results/<name> or runs/...")
     from_site = OneLineParser(add_help=False)
     site = f"of a rocket's launch site, degrees east: default {LAUNCH_LONGITUDE}"
-    from_site.add_argument("--launch-longitude", type=longitude, default=LAUNCH_LONGITUDE, metavar="L", help=site)
+    from_site.add_argument(
+        "--launch-longitude", type=number(-180, 360), default=LAUNCH_LONGITUDE, metavar="L", help=site
+    )
     command = commands.add_parser("publish", help="add a run to a results folder")
     command.add_argument("run_dir", type=Path, help="a finished run: runs/...")
     command.add_argument("folder", type=Path, help="results/<name>, made if it does not exist")

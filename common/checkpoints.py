@@ -49,7 +49,7 @@ def read_checkpoint(
         # this check comes first, because another script's file has other arguments, too
         if env_ids and isinstance(env_id, str) and env_id not in env_ids:
             raise BadInput(f"{flag}{path}: is of {env_id}; this script takes {', '.join(env_ids)}")
-        allowed = {name: types_of(kind) for name, kind in expected.items()}
+        allowed = {name: get_args(kind) or (kind,) for name, kind in expected.items()}  # of `float | None` both
         wrong = [name for name, kinds in allowed.items() if type(args[name]) not in kinds]
         metadata.setdefault("training_seconds", metadata["wall_seconds"])  # an older file has only this time
         counters = {name: kind(metadata[name]) for name, kind in COUNTERS.items()}
@@ -68,11 +68,6 @@ def read_checkpoint(
     if not all(np.isfinite(tensor).all() for tensor in tensors.values()):
         raise BadInput(f"{flag}{path}: holds a NaN or an infinity; its weights must be finite")
     return {"args": args, "counters": counters, "tensors": tensors}
-
-
-def types_of(kind) -> tuple[type, ...]:
-    """The types of which an annotation such as `float | None` consists."""
-    return get_args(kind) or (kind,)
 
 
 def read_metadata(data: bytes) -> dict[str, str]:

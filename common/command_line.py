@@ -83,11 +83,3 @@ def utc(text: str) -> datetime:
     if not 1900 <= moment.year <= 2200:
         raise argparse.ArgumentTypeError(f"{text!r} must be a moment of the years 1900 to 2200")
     return moment
-
-
-def longitude(text: str) -> float:
-    """Argument type: degrees east."""
-    value = number_in(text)
-    if not -180 <= value <= 360:
-        raise argparse.ArgumentTypeError(f"{text!r} must be degrees east, from -180 to 360")
-    return value

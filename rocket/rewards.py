@@ -37,12 +37,13 @@ def guidance_reward(u, up, along, pitch):
 
 
 def penalties(mission: Mission, altitude, time, turn, burnt, left, propellant_price):
-    """R_penalties = -40 c (2 - t / t_end) - 0.024 o - 0.024 s - 0.001 |u_t - u_{t-1}| - w_m (b + c l) / mass_unit.
+    """R_penalties = -40 c (2 - t / t_end) - 0.024 o - 0.024 s - 0.001 |u_t - u_{t-1}| - p (b + c l) / mass_unit.
 
     - c = 1[h < 0] is a crash. It must cost more than the worst miss, and more the earlier it comes. A policy whose
       flights all crash then improves by crashing later.
     - o = clip((h + 5 km - ceiling) / 100 km, 0, 1) is the overshoot.
     - s = clip((floor - h) / 30 km, 0, 1) from `floor_from` on: the flight is too low for its speed.
+    - p is the `propellant_price` of `RocketTraining`.
     - b (kg) is the propellant that a step of the last phase burns, l (kg) what a crash leaves of it.
 
     Altitude h (m) and time t (s) are those of the step's end. t_end (s) is the rocket's end_time. The mission has the
