@@ -194,10 +194,7 @@ class BatchedEnv(VectorEnv):
     def rows_of(self, options: dict, name: str, width: int, holds: Callable = np.isfinite, allowed: str = "finite"):
         """An option of a reset as an array (N, width) of finite numbers. BadInput unless `holds` is true of all."""
         given = options[name]
-        try:
-            rows = np.asarray(given, dtype=np.float64)
-        except (TypeError, ValueError):
-            rows = np.empty(0)
+        rows = as_numbers(given)
         if rows.shape != (self.num_envs, width) or not (np.isfinite(rows) & holds(rows)).all():
             raise BadInput(f"options[{name!r}] must be {allowed}, of shape ({self.num_envs}, {width}); got {given!r}")
         return rows
@@ -315,6 +312,14 @@ class BatchedEnv(VectorEnv):
         time, control, state = self._snapshot()
         for k in np.flatnonzero(mask):
             self._trails[k].append((time[k], control[k], state[k]))
+
+
+def as_numbers(given) -> np.ndarray:
+    """An option of a reset as a new array in float64. It is empty if the option has no numbers."""
+    try:
+        return np.array(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        return np.empty(0)
 
 
 def warn_of_no_mode(env):

@@ -15,7 +15,17 @@ import numpy as np
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
 
-from common.batch import RENDERED, BatchedEnv, SingleEnv, Training, check_options, checked, numeric, refuse_autoreset
+from common.batch import (
+    RENDERED,
+    BatchedEnv,
+    SingleEnv,
+    Training,
+    as_numbers,
+    check_options,
+    checked,
+    numeric,
+    refuse_autoreset,
+)
 from common.errors import BadInput, is_finite, refuse_unless
 from common.flying import fly_until_ended
 from rocket.dispersion import (
@@ -476,10 +486,7 @@ class RocketVectorEnv(BatchedEnv):
 
 def given_numbers(name: str, given, fits: Callable, allowed: str) -> np.ndarray:
     """An option of `reset` in float64. Raises BadInput unless its shape `fits` and all its numbers are finite."""
-    try:
-        numbers = np.array(given, dtype=np.float64)
-    except (TypeError, ValueError):
-        numbers = np.empty(0)
+    numbers = as_numbers(given)
     refuse_unless(fits(numbers.shape), f"options[{name!r}]", f"of shape {numbers.shape}", allowed)
     bad = numbers[~np.isfinite(numbers)]
     refuse_unless(not len(bad), f"an entry of options[{name!r}]", bad[:1].sum(), allowed)
