@@ -150,12 +150,12 @@ RECIPES = {
 
 
 def recipe(args):
-    """What our recipe changes for the environments of `args`. An id without a recipe takes the first one."""
-    return RECIPES.get(args.env_id, RECIPES[ENV_IDS[0]])
+    """What our recipe changes for the environments of `args`."""
+    return RECIPES[args.env_id]
 
 
 # Problem: input and action --------------------------------------------------------------------------------------------
-ENV_IDS = ("DoubleIntegrator-v0", "DoubleIntegratorWaypoints-v0")
+ENV_IDS = tuple(RECIPES)
 ENV_OPTIONS = ("observe_phase", "observe_velocity")  # arguments of the environments
 FIXED_OPTIONS = {"scaled_action": True}  # arguments that no flag sets
 INITIAL_ACTION = [0.0]  # the policy's output before training, in units of the bound
@@ -178,11 +178,8 @@ def mean_action(output, action_scale):
 
 def describe(episodes, metrics):
     """The part of a progress line about the sampled episodes (`final_info` arrays) and the last evaluation, if any."""
-    words = f"return {episodes['episodic_return'].mean():8.2f}"
-    if "cost" in episodes:
-        words += f"  cost {episodes['cost'].mean():7.3f}"
-    if "hit" in episodes:
-        words += "  hits " + " ".join(f"{share:4.0%}" for share in episodes["hit"].mean(axis=0))
+    words = f"return {episodes['episodic_return'].mean():8.2f}  cost {episodes['cost'].mean():7.3f}"
+    words += "  hits " + " ".join(f"{share:4.0%}" for share in episodes["hit"].mean(axis=0))
     if "ratio_of_sums" in metrics:
         words += f"  ratio {metrics['ratio_of_sums']:.4f}"
     return words
@@ -205,8 +202,7 @@ def curriculum(args, progress):
     """
     group = round(args.flights_per_start.at(progress))
     training = {"flights_per_start": group}
-    problem = PROBLEMS.get(args.env_id)
-    if problem and problem.circles_count:
+    if PROBLEMS[args.env_id].circles_count:
         training["radius_scale"] = math.exp(args.log_radius.at(progress))
         training["bonus_width"] = BONUS_WIDTH if group > 1 else 0.0
     return training

@@ -179,7 +179,7 @@ def recipe(args):
 
 
 # Problem: input and action --------------------------------------------------------------------------------------------
-ENV_IDS = ("VanDerPol-v0", "VanDerPolWaypoints-v0", *own_ids())  # and problems of your own
+ENV_IDS = (*RECIPES, *own_ids())  # and problems of your own
 ENV_OPTIONS = ("observe_phase", "observe_velocity")  # arguments of the environments
 FIXED_OPTIONS = {"scaled_action": True}  # arguments that no flag sets
 INITIAL_ACTION = [0.0]  # the policy's output before training, in units of the bound
