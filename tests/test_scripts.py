@@ -1067,7 +1067,7 @@ def test_id_that_no_environment_has(monkeypatch):
     """A script's id whose line in PROBLEMS is missing."""
     monkeypatch.setattr(DI, "ENV_IDS", (*DI.ENV_IDS, "Forgotten-v0"))
     with pytest.raises(BadInput, match="env_id is 'Forgotten-v0', of no family"):
-        parse("--env-id=Forgotten-v0")
+        parse("--env-id=Forgotten-v0", "--recipe=paper")
 
 
 def test_minibatches_left_alone_are_lowered(capsys):
