@@ -852,4 +852,4 @@ def main(argv):
 
 
 if __name__ == "__main__":
-    runs.start(main)
+    runs.run_script(main)

@@ -808,4 +808,4 @@ def main(argv):
 
 
 if __name__ == "__main__":
-    runs.start(main)
+    runs.run_script(main)

@@ -362,7 +362,7 @@ def largest_group(most, shares):
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def start(main):
+def run_script(main):
     """Run a script's `main(argv)`.
 
     Ctrl-C ends it with exit status 130, SIGTERM with 143, and bad input with one line and 1.
