@@ -47,6 +47,12 @@ def energy_optimal_acceleration(r, v, seconds) -> np.ndarray:
     return -6 * r / t**2 - 4 * v / t
 
 
+def drdv_acceleration(lander: Lander, obs) -> np.ndarray:
+    """D'Souza's acceleration (n, 3), with gravity, by the time to go of the nominal gravity."""
+    r, v = obs[:, :3], obs[:, 3:6]
+    return energy_optimal_acceleration(r, v, energy_optimal_time(r, v, lander.gravity))
+
+
 def drdv(lander: Lander, gravity: np.ndarray) -> Callable:
     """D'Souza's law with the gravity (n, 3) of each flight and the nominal mass, which it takes as constant.
 
@@ -54,10 +60,7 @@ def drdv(lander: Lander, gravity: np.ndarray) -> Callable:
     """
 
     def policy(obs, t):
-        r, v = obs[:, :3], obs[:, 3:6]
-        seconds = energy_optimal_time(r, v, lander.gravity)
-        acceleration = energy_optimal_acceleration(r, v, seconds) - gravity
-        return lander.mass * acceleration / lander.greatest_thrust
+        return lander.mass * (drdv_acceleration(lander, obs) - gravity) / lander.greatest_thrust
 
     return policy
 
@@ -143,9 +146,7 @@ def drdv_estimated(lander: Lander) -> Callable:
         if t == 0:
             estimate = Estimate(lander, len(obs))
         estimate.update(obs)
-        r, v = obs[:, :3], obs[:, 3:6]
-        seconds = energy_optimal_time(r, v, lander.gravity)
-        return estimate.command(energy_optimal_acceleration(r, v, seconds)) / lander.greatest_thrust
+        return estimate.command(drdv_acceleration(lander, obs)) / lander.greatest_thrust
 
     return policy
 
