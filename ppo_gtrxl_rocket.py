@@ -45,7 +45,6 @@ from envs import ROCKETS
 from rocket.failure import FAILURE_TIMES
 from rocket.policy_constants import DIFFERENCES, WIDE_DIFFERENCES, policy_constants
 from rocket.rewards import TERMINAL_SCALE, mass_rewards
-from runs import Numbers
 
 
 @dataclass
@@ -90,7 +89,7 @@ class Args:
     failure: Annotated[float, flags.Range(0.0, 0.3)] = 0.0
     # when thrust is lost: at a "random" moment or at the last stage's "ignition"
     failure_time: Annotated[str, flags.Words(FAILURE_TIMES), flags.Policy.SUGGESTS] = "random"
-    navigation_noise: Numbers = None  # standard deviations, m and m/s, of the observed position and velocity
+    navigation_noise: flags.Numbers = None  # standard deviations, m and m/s, of the observed position and velocity
 
     # Table 1
     num_blocks: flags.Blocks = 6  # number of GTrXL blocks (0: a plain MLP, without memory)

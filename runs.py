@@ -24,7 +24,7 @@ import zipfile
 from dataclasses import replace
 from itertools import takewhile
 from pathlib import Path
-from typing import Annotated, Any, NoReturn, get_type_hints
+from typing import Any, NoReturn, get_type_hints
 
 import gymnasium as gym
 import numpy as np
@@ -50,16 +50,6 @@ gc.freeze()  # imported modules are never garbage, and looking through them take
 # Arguments
 # ---------------------------------------------------------------------------------------------------------------------
 
-Numbers = Annotated[
-    list | None,
-    tyro.constructors.PrimitiveConstructorSpec(
-        nargs="*",
-        metavar="NUMBER ...",
-        instance_from_str=lambda words: [float(word) for word in " ".join(words).split()],
-        is_instance=lambda value: value is None or isinstance(value, list),
-        str_from_instance=lambda value: [str(number) for number in value or ()],
-    ),
-]
 WORDS_OF_SCHEDULES = tyro.constructors.PrimitiveConstructorSpec(
     nargs="*",
     metavar="VALUE | PLACE:VALUE ...",

@@ -10,6 +10,8 @@ from dataclasses import fields
 from enum import Enum
 from typing import Annotated, Any, NamedTuple, TypeVar, get_args, get_type_hints
 
+import tyro
+
 from common.schedule import Schedule
 
 
@@ -45,6 +47,16 @@ Positive = Annotated[float, Range(1e-9, 1e9)]
 ShareSchedule = Annotated[Schedule, Range(0.0, 1.0)]
 WeightSchedule = Annotated[Schedule, Range(0.0, 1e3)]
 CountSchedule = Annotated[Schedule, Range(1, 10**6)]
+Numbers = Annotated[
+    list | None,
+    tyro.constructors.PrimitiveConstructorSpec(
+        nargs="*",
+        metavar="NUMBER ...",
+        instance_from_str=lambda words: [float(word) for word in " ".join(words).split()],
+        is_instance=lambda value: value is None or isinstance(value, list),
+        str_from_instance=lambda value: [str(number) for number in value or ()],
+    ),
+]
 LogStd = Annotated[Schedule, Range(-8.0, 0.5)]
 
 # of a policy: its network, and what it observes
