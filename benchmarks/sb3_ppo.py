@@ -2,7 +2,7 @@
 
     pip install -r benchmarks/requirements.txt
     python -m benchmarks.sb3_ppo --env-id DoubleIntegrator-v0 --samples 2560000
-    python -m benchmarks.sb3_ppo --env-id RocketAscentCutoff-v0 --batch-size 512 --learning-rate 1e-3
+    python -m benchmarks.sb3_ppo --env-id RocketAscentCutoff-v0 --batch-size 512 --learning-rate 1e-3 --mass-weight 0.3
     python -m benchmarks.sb3_ppo --env-id RocketAscentCutoff-v0 --recurrent --dispersion 1 --start RUN.zip
 
 It gets what our script gives its own learner: the curriculum (scale of R_terminal), the first mean action and its
@@ -31,18 +31,19 @@ from stable_baselines3.common.vec_env import VecEnvWrapper, VecMonitor, VecNorma
 import evaluate
 import ppo_gtrxl_di
 import ppo_gtrxl_rocket
-import ppo_gtrxl_vdp
-from benchmarks.policies import environment_options, script_of
+from benchmarks.policies import environment_options
 from benchmarks.records import provenance
-from common.command_line import OneLineParser, integer
+from common.command_line import OneLineParser, integer, output_file
 from common.files import write_json
 from common.flags import Range, facts
 from common.schedule import Schedule
-from common.tasks import env_ids, task_of
+from common.tasks import task_of
 from sb3_env import NativeVecEnv
 
 PARTS = 20  # evaluated after each such part of the samples
-SCRIPTS = (ppo_gtrxl_di, ppo_gtrxl_vdp, ppo_gtrxl_rocket)  # whose problems it takes
+NUM_ENVS = 32
+OF_THE_SCRIPT = ("dispersion", "mass_weight", "log_std")  # flags that are arguments of the script
+SCRIPTS = {"DoubleIntegrator-v0": ppo_gtrxl_di, "RocketAscentCutoff-v0": ppo_gtrxl_rocket}
 
 
 class OurFeatures(VecEnvWrapper):
@@ -201,7 +202,6 @@ def make_model(options, script, args, normalised, steps):
         n_steps=steps,
         batch_size=options.batch_size,
         n_epochs=options.epochs,
-        gamma=options.gamma,
         policy_kwargs={"net_arch": [64, 64], "log_std_init": args.log_std.at(0.0), **width},
         seed=options.seed,
         device="cpu",
@@ -214,52 +214,38 @@ def make_model(options, script, args, normalised, steps):
     return model
 
 
-def flag(name):
-    return f"--{name.replace('_', '-')}"
-
-
 def parse_args():
     parser = OneLineParser(description=__doc__.splitlines()[0])
-    parser.add_argument(
-        "--env-id",
-        default="DoubleIntegrator-v0",
-        choices=[env_id for env_id in env_ids() if script_of(env_id) in SCRIPTS],
-    )
+    parser.add_argument("--env-id", default="DoubleIntegrator-v0", choices=SCRIPTS)
     parser.add_argument("--samples", type=integer(1, 10**9), default=2_560_000)
     parser.add_argument("--features", default="ours", choices=["ours", "raw"])
     parser.add_argument("--recurrent", action="store_true", help="an LSTM: sb3-contrib's RecurrentPPO")
     parser.add_argument("--dispersion", type=float, help="every flight another vehicle (a rocket's)")
-    parser.add_argument("--mass-weight", type=float, default=3.0, help="highest price of a mission's mass_unit")
+    parser.add_argument("--mass-weight", type=float, help="highest price of a mission's mass_unit; without it none")
     parser.add_argument("--log-std", type=float, help="first log-std (default: our script's, or that of --start)")
-    parser.add_argument("--num-envs", type=integer(1, 10**9), default=32)
     parser.add_argument("--batch-size", type=integer(1, 10**9), default=64)
     parser.add_argument("--epochs", type=integer(1, 10**9), default=10)
     parser.add_argument("--learning-rate", type=float, default=3e-4, help="falls linearly to zero")
-    parser.add_argument("--gamma", type=float, default=0.99)
-    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--seed", type=integer(1, 2**31 - 1), default=1, help="0 is that of the evaluation")
     parser.add_argument("--start", type=Path, help="begin with this .zip and the .pkl beside it")
-    parser.add_argument(
-        "--save", type=Path, help="write the policy as this .zip and its VecNormalize as .pkl beside it"
-    )
-    parser.add_argument("--json", type=Path, help="write the figures there")
+    parser.add_argument("--save", type=output_file, help="write the policy as this .zip and a .pkl beside it")
+    parser.add_argument("--json", type=output_file, help="write the figures there")
     options = parser.parse_args()
-    script = script_of(options.env_id)
+    script = SCRIPTS[options.env_id]
     ranges = facts(script.Args, Range)
-    for name, value in vars(options).items():
-        low, high = ranges.get(name, (None, None))
-        if low is not None and value is not None and not low <= value <= high:
-            parser.error(f"{flag(name)} {value}: must be between {low} and {high}")
-    if options.seed == 0:
-        parser.error("--seed 0: must be at least 1; the evaluation's starts are those of seed 0")
-    for name, without in (("dispersion", None), ("mass_weight", 3.0)):
-        if getattr(options, name) != without and not hasattr(script.Args, name):
-            parser.error(f"{flag(name)} {getattr(options, name)}: only a rocket has it, not {options.env_id}")
+    for name in OF_THE_SCRIPT:
+        value = getattr(options, name)
+        if value is None:
+            continue
+        flag = f"--{name.replace('_', '-')} {value}"
+        if not hasattr(script.Args, name):
+            parser.error(f"{flag}: only a rocket has it, not {options.env_id}")
+        low, high = ranges.get(name, (-np.inf, np.inf))
+        if not low <= value <= high:
+            parser.error(f"{flag}: must be between {low} and {high}")
     for path in (options.start, options.start and options.start.with_suffix(".pkl")):
         if path and not path.is_file():
             parser.error(f"--start {options.start}: there is no {path}")
-    for path in (options.save, options.json):
-        if path and not path.parent.is_dir():
-            parser.error(f"{path}: its folder must exist")
     return options
 
 
@@ -267,22 +253,21 @@ def main():
     options = parse_args()
     code = provenance()  # now: hours later it may be another
     torch.set_num_threads(1)
-    script = script_of(options.env_id)
+    script = SCRIPTS[options.env_id]
     args = script.Args(**{**script.recipe(script.Args(env_id=options.env_id)), "env_id": options.env_id})
     args = replace(args, log_std=script.Args.log_std, flights_per_start=1)  # the library learns its noise
-    asked = {name: getattr(options, name) for name in ("dispersion", "mass_weight", "log_std")}
-    given = {name: value for name, value in asked.items() if value is not None and hasattr(args, name)}
-    args = replace(args, **given)
+    given = {name: getattr(options, name) for name in OF_THE_SCRIPT}
+    args = replace(args, **{name: value for name, value in given.items() if value is not None})
     env_options = environment_options(script, args)
 
-    batch = gym.make_vec(options.env_id, num_envs=options.num_envs, **env_options).unwrapped
+    batch = gym.make_vec(options.env_id, num_envs=NUM_ENVS, **env_options).unwrapped
     venv = VecMonitor(NativeVecEnv(batch))
     if options.features == "ours":
         venv = OurFeatures(venv, script, options.env_id)
     if options.start:
         normalised = VecNormalize.load(options.start.with_suffix(".pkl"), venv)
     else:
-        normalised = VecNormalize(venv, gamma=options.gamma, clip_reward=np.inf)
+        normalised = VecNormalize(venv, clip_reward=np.inf)
 
     model = make_model(options, script, args, normalised, batch.episode_steps)
     evaluation = Evaluation(options.env_id, env_options, options.samples)
