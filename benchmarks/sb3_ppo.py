@@ -33,7 +33,6 @@ from common.command_line import OneLineParser, integer, output_file
 from common.files import write_json
 from common.schedule import Schedule
 from common.tasks import task_of
-from envs import ROCKETS
 from sb3_env import NativeVecEnv
 
 PARTS = 20  # evaluated after each such part of the samples
@@ -166,7 +165,7 @@ def parse_args():
     parser.add_argument("--json", type=output_file, help="write the figures there")
     options = parser.parse_args()
     if options.mass_weight is not None:
-        if options.env_id not in ROCKETS:
+        if not hasattr(SCRIPTS[options.env_id].Args, "mass_weight"):
             parser.error(f"--mass-weight {options.mass_weight}: only a rocket has it, not {options.env_id}")
         if not 0 <= options.mass_weight < np.inf:
             parser.error(f"--mass-weight {options.mass_weight}: must be between 0 and infinity")
