@@ -6,10 +6,9 @@
 |---|---|
 | `run_seeds` | trains the lists in `benchmarks/trainings/` and publishes them |
 | `same_training` | shows whether a change has touched the learning, to the bit |
-| `speed` | times environments, updates on a CPU or a GPU, and whole trainings |
+| `speed` | times environments, and updates on a CPU or a GPU |
 | `memory` | prints the tables of results/memory and results/ablation |
 | `attention` | draws what the attention heads look at |
-| `last_weights` | flies a run's last weights beside its averaged ones |
 | `peers`, `sb3_ppo` | Stable-Baselines3 on the same problems: the table, one training |
 | `gradient` | trains by the gradient through the physics |
 | `decision` | times a policy's decision by onnxruntime and by torch |

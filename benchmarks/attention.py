@@ -3,10 +3,9 @@
     python -m benchmarks.attention results/rocket_dispersed results/memory/attention_rocket.png
     python -m benchmarks.attention results/vdp_waypoints results/memory/attention_waypoints.png
 
-Flies the mean action once (a rocket trained on dispersions: the first draw of `--eval-seed`, else the first start),
-draws a panel for each head, and prints how far back each looks: the mean distance under its weights, over the whole
-flight, in the 20 s after each staging (or the 1 s after each waypoint), and what uniform weights would give; and its
-largest weight on an earlier step.
+Flies the mean action once (a rocket trained on dispersions: the first draw of seed 0, else the first start), draws a
+panel for each head, and prints how far back each looks: the mean distance under its weights, what uniform weights would
+give, and its largest weight on an earlier step.
 """
 
 from __future__ import annotations
@@ -20,16 +19,16 @@ import torch
 from matplotlib.figure import Figure
 
 from benchmarks.policies import load
-from common.command_line import OneLineParser, integer
+from common.command_line import OneLineParser
 from common.flying import fly_until_ended
 from common.tasks import task_of
 from drawing.style import save_figures
 
 
-def observations(agent, args, options, eval_seed):
+def observations(agent, args, options):
     """One flight of the mean action: observations (T, obs), their times (T,) in s, and the begins of phases in s."""
     environment = gym.make_vec(args.env_id, num_envs=1, **options)
-    obs, _ = environment.reset(options=task_of(args.env_id).reset_options(eval_seed, 1, **options))
+    obs, _ = environment.reset(options=task_of(args.env_id).reset_options(0, 1, **options))
     policy = agent.make_policy(environment.episode_steps)
     seen = []
     phases = [environment.phase[0]]
@@ -47,10 +46,9 @@ def observations(agent, args, options, eval_seed):
 def weights(agent, obs):
     """The attention weights (blocks, H, T, L + 1) of a flight's steps, by distance: 0 is the step itself.
 
-    They are A_ij = (x_i W^Q) (x_j W^K + R_{i-j})^T / sqrt(d_k) and its softmax over j = i - L .. i, written out again.
     Before the start lies the evaluation's memory of zeros, whose weights count.
     """
-    inputs, L, T = [], agent.memory_length, len(obs)
+    inputs, L = [], agent.memory_length
     hooks = [block.attention.register_forward_pre_hook(lambda _, given: inputs.append(given)) for block in agent.blocks]
     agent.encode(torch.as_tensor(obs, dtype=agent.actor_logstd.dtype)[None], agent.new_memory(1, noise=0.0))
     for hook in hooks:
@@ -58,11 +56,11 @@ def weights(agent, obs):
     found = []
     for block, (x, memory) in zip(agent.blocks, inputs):
         attention = block.attention
-        q = attention.query(x[0]).unflatten(-1, (attention.num_heads, attention.dk))  # (T, H, dk)
-        k = attention.key(torch.cat([memory[0], x[0]])).unflatten(-1, (attention.num_heads, attention.dk))
-        window = torch.stack([k[L - back : L - back + T] for back in range(L + 1)], dim=2)  # (T, H, L + 1, dk)
-        scores = torch.einsum("thd,thld->htl", q, window + attention.R) / attention.dk**0.5
-        found.append(scores.softmax(dim=-1))
+        (keys, _), projections, R = attention.start_cache(torch.cat([memory, x], dim=1), 0)  # (1, H, L + T, dk)
+        q, _ = attention.project(x[0], projections)  # (T, H, 1, dk)
+        windows = keys[0].unfold(1, L + 1, 1).permute(1, 0, 3, 2)  # (T, H, L + 1, dk)
+        scores = q @ (windows + R).transpose(-1, -2)  # (T, H, 1, L + 1), distance L first
+        found.append(scores.softmax(dim=-1).squeeze(2).transpose(0, 1).flip(-1))
     return torch.stack(found).numpy()
 
 
@@ -88,48 +86,38 @@ def attention_figure(found, t, events, title):
     return figure
 
 
-def lines(found, t, events):
-    """The printed table: each head's mean distance (s) under its weights, of all steps and of those after an event.
-
-    And its largest weight on a step of the flight other than the one that asks.
-    """
+def lines(found, t):
+    """The printed table: each head's mean distance (s) under its weights, and its largest weight on an earlier step."""
     dt, window = t[1] - t[0], found.shape[-1]
-    after = np.zeros(len(t), dtype=bool)
-    for event in events:
-        after |= (t >= event) & (t < event + 10 * dt)
     back = dt * found @ np.arange(window)  # (blocks, H, T)
     rows = [f"mean distance looked back, s (uniform weights: {dt * (window - 1) / 2:.2f})"]
     for b, h in np.ndindex(found.shape[:2]):
-        late = f", in the {10 * dt:g} s after an event {back[b, h, after].mean():.2f}" if after.any() else ""
-        own = found[b, h, :, 0].mean()
-        row = f"  block {b + 1}, head {h + 1}: {back[b, h].mean():.2f}{late}; weight on the step itself {own:.2f}"
-        rows.append(row + heaviest(found[b, h], dt))
+        weight, step, other = heaviest(found[b, h])
+        at = f"{weight:.2f} (at {dt * step:.1f} s on that of {dt * other:.1f} s)"
+        rows.append(f"  block {b + 1}, head {h + 1}: {back[b, h].mean():.2f}; at most on another step {at}")
     return rows
 
 
-def heaviest(found, dt):
-    """The largest of a head's weights (T, L + 1) on an earlier step of the flight, in words; "" without a memory."""
+def heaviest(found):
+    """A head's largest weight (T, L + 1) on an earlier step of the flight, the step that looks, and the earlier one."""
     steps, backs = np.indices(found.shape)
     earlier = np.where((backs > 0) & (backs <= steps), found, 0.0)
-    if not earlier.any():
-        return ""
     step, back = np.unravel_index(earlier.argmax(), found.shape)
-    return f", at most {earlier.max():.2f} on another (at {dt * step:.1f} s on that of {dt * (step - back):.1f} s)"
+    return earlier.max(), step, step - back
 
 
 def main():
     parser = OneLineParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path, help="results/<name> or runs/...")
     parser.add_argument("figure", type=Path, help="the .png to write")
-    parser.add_argument("--eval-seed", type=integer(0, 2**31 - 1), default=0)
     options = parser.parse_args()
     try:
         agent, args, env_options = load(options.folder / "agent.safetensors")
         if not args.num_blocks:
             raise ValueError(f"{options.folder}: num_blocks is 0; a plain MLP has no attention")
-        obs, t, events = observations(agent, args, env_options, options.eval_seed)
+        obs, t, events = observations(agent, args, env_options)
         found = weights(agent, obs)
-        print("\n".join(lines(found, t, events)))
+        print("\n".join(lines(found, t)))
         title = f"{args.env_id}: attention along one flight (lines: a new phase)"
         figure = attention_figure(found, t, events, title)
         save_figures(options.figure.parent, {options.figure.name: figure})

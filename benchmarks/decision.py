@@ -52,14 +52,14 @@ class OnnxPolicy:
         return action
 
 
-def compare(env_id: str, policies: dict, n: int = 1, seed: int = 0, **env_options):
+def compare(env_id: str, policies: dict, n: int = 1, **env_options):
     """Fly the first of `policies` on n flights and ask the others, too, on the same observations.
 
     Returns the median microseconds of a decision and the actions (T, n, actions), by policy. Actions after a flight's
     end are NaN.
     """
     envs = gym.make_vec(env_id, num_envs=n, **env_options)
-    obs, _ = envs.reset(options=task_of(env_id).reset_options(seed, n, **env_options))
+    obs, _ = envs.reset(options=task_of(env_id).reset_options(0, n, **env_options))
     actions = {name: [] for name in policies}
     seconds = {name: [] for name in policies}
     first = next(iter(policies))

@@ -4,7 +4,7 @@
     python -m benchmarks.gradient cutoff --seed 1       # the nominal rocket with cut-off: three minutes
     python -m benchmarks.gradient dispersed --seed 1    # from there on, every flight another vehicle: five minutes
     python -m benchmarks.gradient gtrxl --seed 1        # the nominal rocket by PPO's network with memory: ten minutes
-    python -m benchmarks.gradient --table               # of what is in results/peers, with our PPO beside it
+    python -m benchmarks.gradient                       # prints what is in results/peers, with our PPO beside it
     python -m benchmarks.gradient dispersed --save runs/gradient.safetensors
     python evaluate.py opponents results/rocket_dispersed --also gradient=runs/gradient.safetensors
 
@@ -23,12 +23,9 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import sys
 import time
 from dataclasses import dataclass, replace
-from pathlib import Path
-from types import ModuleType
 from typing import NamedTuple
 
 import gymnasium as gym
@@ -39,9 +36,8 @@ import torch.nn.functional as F
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 import evaluate
-import ppo_gtrxl_di
 import ppo_gtrxl_rocket
-from benchmarks.policies import ROOT, environment_options
+from benchmarks.policies import ROOT, environment_options, script_of
 from benchmarks.records import cell, provenance, read_record
 from common.checkpoints import read_checkpoint
 from common.command_line import OneLineParser, integer, output_file
@@ -421,47 +417,43 @@ def train_rocket(agent, env, recipe: Recipe, curve: Curve):
 # The rows of the table
 # ---------------------------------------------------------------------------------------------------------------------
 
-DI_KEYS = {"ratio_of_sums": "ratio of sums", "ratio_mean": "mean ratio", "ratio_p95": "p95"}
-CUTOFF_KEYS = {"error_norm": "||error||", "final_mass_kg": "mass (kg)", "mass_ratio_reached": "mass / optimum"}
-DISPERSED_KEYS = {"dispersed_error_median": "||error|| median", "dispersed_error_p95": "p95"}
-DISPERSED_KEYS |= {"dispersed_mass_mean_kg": "mass (kg)"}
-
 
 @dataclass(frozen=True)
 class Row:
-    """A training, its label, and the folder of results/ with PPO's policies for the same problem."""
+    """A training, the folder of results/ with PPO's policies for the same problem, and what the table has of both."""
 
-    title: str
     env_id: str
-    script: ModuleType  # of ours: the network, and what it sees
     result: str
-    keys: dict[str, str]  # of the evaluation -> what the table calls it
+    keys: tuple[str, ...]  # of the evaluation
     recipe: Recipe
     start: str = ""  # the row whose training comes first
     dispersion: float = 0.0
     has_memory: bool = False
 
+    @property
+    def script(self):
+        """Ours: the network, and what it sees."""
+        return script_of(self.env_id)
 
+
+FOLDER = ROOT / "results" / "peers"  # of the runs' records
 CUTOFF = "RocketAscentCutoff-v0"
 NOMINAL = Recipe(updates=300, flights=1, learning_rate=2e-3)
 SHORT = Recipe(updates=100, flights=1, learning_rate=2e-3)  # an update of the GTrXL takes ten times as long
+CUTOFF_KEYS = ("error_norm", "final_mass_kg", "mass_ratio_reached")
 ROWS = {
     "di": Row(
-        title="double integrator",
         env_id="DoubleIntegrator-v0",
-        script=ppo_gtrxl_di,
         result="di",
-        keys=DI_KEYS,
+        keys=("ratio_of_sums", "ratio_mean", "ratio_p95"),
         recipe=Recipe(updates=600, flights=256, learning_rate=3e-3),
     ),
-    "cutoff": Row("cut-off", CUTOFF, ppo_gtrxl_rocket, "rocket_cutoff", CUTOFF_KEYS, NOMINAL),
-    "gtrxl": Row("cut-off, GTrXL", CUTOFF, ppo_gtrxl_rocket, "rocket_cutoff", CUTOFF_KEYS, SHORT, has_memory=True),
+    "cutoff": Row(CUTOFF, "rocket_cutoff", CUTOFF_KEYS, NOMINAL),
+    "gtrxl": Row(CUTOFF, "rocket_cutoff", CUTOFF_KEYS, SHORT, has_memory=True),
     "dispersed": Row(
-        title="dispersed",
         env_id=CUTOFF,
-        script=ppo_gtrxl_rocket,
         result="rocket_dispersed",
-        keys=DISPERSED_KEYS,
+        keys=("dispersed_error_median", "dispersed_error_p95", "dispersed_mass_mean_kg"),
         recipe=Recipe(updates=120, flights=16, learning_rate=6e-4, damping=1e-8),
         start="cutoff",
         dispersion=1.0,
@@ -534,70 +526,54 @@ def policy_file(agent, args, curve: Curve, recipe: Recipe) -> bytes:
 def ppo_runs(row: Row) -> list[dict]:
     """The evaluations of our PPO's seeds on a row's problem, with the flights and minutes of each training.
 
-    A dispersed training counts the shipped one of the nominal flight, with which each seed began.
+    A dispersed training counts the one of the nominal flight with which each seed began, that of seed 1.
     """
     folder = ROOT / "results" / row.result
     flights = 0
-    seconds = 0.0
+    minutes = 0.0
     if row.start:
-        before = ROOT / "results" / ROWS[row.start].result
-        shipped = read_json(before / "eval.json")
-        flights = ppo_flights(before, shipped)
-        seconds = shipped["wall_seconds"]
+        nominal = ppo_runs(ROWS[row.start])[0]
+        flights = nominal["flights"]
+        minutes = nominal["minutes"]
+    num_envs = read_checkpoint(folder / "agent.safetensors")["args"]["num_envs"]  # of all its seeds
     runs = []
     for path in sorted((folder / "seeds").glob("*.json")):
         run = read_json(path)
-        minutes = (seconds + run["wall_seconds"]) / 60
-        runs.append(run | {"flights": flights + ppo_flights(folder, run), "minutes": minutes})
+        run["flights"] = flights + run["total_updates"] * num_envs
+        run["minutes"] = minutes + run["wall_seconds"] / 60
+        runs.append(run)
     return runs
 
 
-def ppo_flights(folder: Path, run: dict) -> int:
-    """The flights of a training of a results folder: all its seeds have the arguments of the shipped one."""
-    return run["total_updates"] * read_checkpoint(folder / "agent.safetensors")["args"]["num_envs"]
-
-
-def table(folder: Path) -> list[list[str]]:
-    """Lines of cells: of each row that has runs in a folder, and of our PPO's beneath it."""
+def table() -> list[list[str]]:
+    """Lines of cells: of each row that has runs, and of our PPO's beneath it."""
     lines, keys = [], None
     for name, row in ROWS.items():
-        runs = []
-        for path in sorted(folder.glob(f"gradient_{name}_*.json")):
-            last, final = read_record(path)
-            runs.append({"flights": last["flights"], "minutes": last["minutes"], **final})
-        if not runs:
+        records = [read_record(path) for path in sorted(FOLDER.glob(f"gradient_{name}_*.json"))]
+        if not records:
             continue
         if row.keys != keys:
             keys = row.keys
-            lines.append(["", "seeds", "knows", "flights", "minutes", *keys.values(), "a decision (us)"])
-        for title, knows, its_runs in ((row.title, "the physics", runs), ("  our PPO", "its flights", ppo_runs(row))):
-            cells = []
-            for key in ("flights", "minutes", *keys, "decision_us"):
-                cells.append(cell([run[key] for run in its_runs if key in run]))
-            lines.append([title, str(len(its_runs)), knows, *cells])
+            lines.append(["", "seeds", "flights", "minutes", *keys, "decision_us"])
+        for title, runs in ((name, [last | final for last, final in records]), ("  our PPO", ppo_runs(row))):
+            columns = [[run[key] for run in runs if key in run] for key in ("flights", "minutes", *keys, "decision_us")]
+            lines.append([title, str(len(runs)), *map(cell, columns)])
     return lines
 
 
 def parse_args():
     parser = OneLineParser(description=__doc__.splitlines()[0])
-    parser.add_argument("row", nargs="?", choices=ROWS, help="what to train")
+    parser.add_argument("row", nargs="?", choices=ROWS, help="what to train; without it the table is printed alone")
     parser.add_argument("--seed", type=integer(1, 2**31 - 1), default=1)
-    parser.add_argument("--folder", type=Path, default=ROOT / "results" / "peers", help="of the runs' records")
     parser.add_argument("--save", type=output_file, help="where to write the policy, as the scripts do (.safetensors)")
-    parser.add_argument("--table", action="store_true", help="train nothing, print what is there")
-    options = parser.parse_args()
-    if not options.table and options.row is None:
-        parser.error(f"name what to train, one of {', '.join(ROWS)}, or --table")
-    if not os.access(options.folder, os.W_OK):
-        parser.error(f"--folder {options.folder}: must be a folder that can be written to")
-    return options
+    return parser.parse_args()
 
 
 def main():
     options = parse_args()
     torch.set_num_threads(1)
     torch.set_default_dtype(torch.float64)
-    if not options.table:
+    if options.row:
         code = provenance()  # now: minutes later it may be another
         row, curve = ROWS[options.row], Curve()
         agent, args = train(options.row, options.seed, curve)
@@ -605,9 +581,9 @@ def main():
             write_bytes(options.save, policy_file(agent, args, curve, row.recipe))
         record = {**code, "weights": sum(weight.numel() for weight in weights_of(agent)), "curve": curve.points}
         record["final"] = evaluated(row, agent)
-        write_json(options.folder / f"gradient_{options.row}_{options.seed}.json", record)
+        write_json(FOLDER / f"gradient_{options.row}_{options.seed}.json", record)
     try:
-        lines = table(options.folder)
+        lines = table()
     except (OSError, ValueError) as error:
         sys.exit(f"error: {error}")
     for line in lines:

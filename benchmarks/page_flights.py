@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from py_mini_racer import MiniRacer
 
+import envs  # noqa: F401 - makes every id known to `task_of`
 from common.checkpoints import read_checkpoint
 from common.command_line import OneLineParser
 from common.evaluations import read_evaluation

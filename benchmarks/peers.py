@@ -5,8 +5,8 @@
     python -m benchmarks.peers --table        # of what is there
 
 Each row is one way of learning, with seeds 1 to 3, by `benchmarks.sb3_ppo` with the settings that were best for it in
-short trials (docs/other-learners.md). Numbers are medians with the range of all seeds. Policies and logs are in runs/.
-The exit status is 1 if a run failed.
+short trials (docs/other-learners.md). Numbers are medians with the range of all seeds. Logs are in runs/. The exit
+status is 1 if a run failed.
 """
 
 from __future__ import annotations
@@ -21,26 +21,20 @@ from benchmarks.run_seeds import end_with_the_runs, start_logged, work
 from common.command_line import OneLineParser, integer
 
 FOLDER = Path("results/peers")
+SEEDS = (1, 2, 3)
 LOW_PRICE = "--mass-weight 0.3"  # of the propellant: under the full one, which rises to 3, it loses the orbit
 CUTOFF = f"--env-id RocketAscentCutoff-v0 --batch-size 512 --learning-rate 1e-3 --samples 7450000 {LOW_PRICE}"
-LSTM = "--env-id RocketAscentCutoff-v0 --recurrent --batch-size 3848 --epochs 6 --learning-rate 1e-3 --samples 3700000"
 DI_KEYS = {"ratio_of_sums": "ratio of sums", "ratio_p95": "p95", "hit_rate": "hits"}
 ROCKET_KEYS = {"error_norm": "||error||", "perigee_km": "perigee (km)", "mass_ratio": "mass / optimum"}
-DISPERSED_KEYS = {"dispersed_error_median": "median", "dispersed_error_p95": "p95", "dispersed_box_rate": "in the box"}
 
 
 @dataclass
 class Peer:
-    """A row: its label, the flags of `sb3_ppo`, the keys of its final evaluation, its seeds.
-
-    `start` names an earlier row: each seed begins with the policy that it saved.
-    """
+    """A row: its label, the flags of `sb3_ppo`, the keys of its final evaluation."""
 
     title: str
     flags: str
     keys: dict[str, str]
-    seeds: tuple[int, ...] = (1, 2, 3)
-    start: str = ""
 
 
 PEERS = {
@@ -48,14 +42,6 @@ PEERS = {
     "cutoff_low_price": Peer("cut-off, a tenth of that price", CUTOFF, ROCKET_KEYS),
     "cutoff_raw": Peer("cut-off, a tenth, raw observations", f"{CUTOFF} --features raw", ROCKET_KEYS),
     "cutoff_longer": Peer("cut-off, a tenth, twice the samples", f"{CUTOFF} --samples 14900000", ROCKET_KEYS),
-    "lstm": Peer("LSTM, cut-off, a tenth", f"{LSTM} {LOW_PRICE}", ROCKET_KEYS, (1,)),
-    "lstm_dispersed": Peer(
-        "LSTM, from there, dispersed",
-        f"{LSTM} --dispersion 1 --mass-weight 0.5 --log-std -3.5 --learning-rate 1e-4",  # with 1e-3 it loses the orbit
-        DISPERSED_KEYS,
-        (1,),
-        start="lstm",
-    ),
     "di": Peer("double integrator", "--samples 2560000", DI_KEYS),
 }
 
@@ -73,16 +59,13 @@ class PeerTraining:
         self.seed = seed
         peer = PEERS[name]
         self.command = ["-m", "benchmarks.sb3_ppo", *shlex.split(peer.flags), "--seed", str(seed)]
-        self.command += ["--save", f"runs/peer_{name}_{seed}.zip", "--json", str(record(name, seed))]
-        if peer.start:
-            self.command += ["--start", f"runs/peer_{peer.start}_{seed}.zip"]
+        self.command += ["--json", str(record(name, seed))]
 
     def is_trained(self):
         return record(self.name, self.seed).exists()
 
     def identity(self):
-        """That of the run which it begins with, so that it waits for that one."""
-        return PEERS[self.name].start or self.name, self.seed
+        return self.name, self.seed
 
     def start(self):
         return start_logged(self.command, f"peer_{self.name}_{self.seed}")
@@ -95,7 +78,7 @@ class PeerTraining:
 def train_all(at_once, rows):
     """Every run of the rows that is missing, `at_once` at a time. Returns those that failed."""
     FOLDER.mkdir(parents=True, exist_ok=True)
-    trainings = [PeerTraining(name, seed) for name in PEERS if name in rows for seed in PEERS[name].seeds]
+    trainings = [PeerTraining(name, seed) for name in PEERS if name in rows for seed in SEEDS]
     return work(trainings, at_once, numbers=True)
 
 
@@ -103,7 +86,7 @@ def table():
     """The lines of the table. Rows with other numbers have their own header."""
     lines, keys = [], None
     for name, peer in PEERS.items():
-        paths = [record(name, seed) for seed in peer.seeds]
+        paths = [record(name, seed) for seed in SEEDS]
         records = [read_record(path) for path in paths if path.exists()]
         if not records:
             continue

@@ -18,18 +18,18 @@ pytestmark = pytest.mark.slow
 
 
 def test_hundreds_of_command_lines(robustness):
-    ended = robustness.fuzz_arguments(300)
+    ended = robustness.command_lines(300)
     assert sum(ended.values()) == 300 and min(ended["works"], ended["refused"]) > 3, ended
 
 
 def test_hundreds_of_damaged_files(robustness):
-    ended = robustness.fuzz_checkpoints(300)
+    ended = robustness.damaged_files(300)
     refused = ended["agent.safetensors refused"], ended["training_state.pt refused"]
     assert sum(ended.values()) == 300 and min(refused) > 30 and sum(refused) < 300, ended
 
 
 def test_hundreds_of_actions(robustness):
-    ended = robustness.fuzz_actions(300)
+    ended = robustness.actions(300)
     assert sum(ended.values()) == 300 and min(ended.values()) > 30, ended
 
 

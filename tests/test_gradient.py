@@ -217,10 +217,8 @@ def test_a_training_of_the_double_integrator_costs_less():
 @pytest.mark.parametrize(
     "argv, line",
     [
-        ([], "name what to train, one of di, cutoff, gtrxl, dispersed, or --table"),
         (["vdp"], "invalid choice: 'vdp'"),
         (["cutoff", "--seed", "0"], "'0' must be a whole number from 1"),
-        (["cutoff", "--folder", "nowhere"], "--folder nowhere: must be a folder"),
         (["cutoff", "--save", "nowhere/agent.safetensors"], "must be a file in an existing, writable folder"),
     ],
 )

@@ -1,15 +1,12 @@
 """`benchmarks.peers`: its table of what is trained, and which runs are left to do."""
 
 import json
-import re
 import subprocess
 import sys
 
 import pytest
 
-import ppo_gtrxl_rocket
 from benchmarks import peers
-from common.schedule import Schedule
 
 
 def trained(folder, name, seed, **final):
@@ -31,10 +28,10 @@ def test_table_of_what_is_there(tmp_path, monkeypatch):
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """An empty folder to train in, with two rows. The second begins with the policies of the first."""
+    """An empty folder to train in, with one row of two seeds."""
     monkeypatch.chdir(tmp_path)
-    rows = {"first": peers.Peer("", "", {}, (1, 2)), "second": peers.Peer("", "", {}, (1, 2), start="first")}
-    monkeypatch.setattr(peers, "PEERS", rows)
+    monkeypatch.setattr(peers, "PEERS", {"first": peers.Peer("", "", {})})
+    monkeypatch.setattr(peers, "SEEDS", (1, 2))
     return tmp_path
 
 
@@ -64,25 +61,10 @@ def test_a_run_that_is_there_is_not_done_again(folder, started):
     assert command[command.index("--seed") + 1] == "2" and "results/peers/first_2.json" in command
 
 
-def test_a_row_waits_for_the_one_that_it_begins_with(folder, started):
-    assert peers.train_all(4, list(peers.PEERS)) == []
-    saved = [command[command.index("--save") + 1] for command in started]
-    assert set(saved[:2]) == {"runs/peer_first_1.zip", "runs/peer_first_2.zip"}
-    begun = [command[command.index("--start") + 1] for command in started[2:]]
-    assert sorted(begun) == sorted(saved[:2])
-
-
 def test_every_command_is_one_that_the_script_takes(monkeypatch):
-    pytest.importorskip("sb3_contrib")
+    pytest.importorskip("stable_baselines3")
     from benchmarks import sb3_ppo
 
     for peer in peers.PEERS.values():
         monkeypatch.setattr(sys, "argv", ["sb3_ppo.py", *peer.flags.split()])
-        options = sb3_ppo.parse_args()
-        assert (peer.start == "lstm") == bool(options.dispersion)
-
-
-def test_the_dispersed_row_has_the_noise_of_ours():
-    """That with which our recipe begins; the mass is paid for in another way."""
-    theirs = float(re.search(r"--log-std (\S+)", peers.PEERS["lstm_dispersed"].flags)[1])
-    assert Schedule(ppo_gtrxl_rocket.DISPERSED["log_std"]).at(0.0) == theirs
+        sb3_ppo.parse_args()

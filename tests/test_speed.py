@@ -1,19 +1,15 @@
-"""`benchmarks.speed`: an update's figures, gathered windows against the scripts, a training beside its shipped run."""
+"""`benchmarks.speed`: an update's figures, gathered windows against the scripts."""
 
-import csv
 import re
 import sys
 from argparse import Namespace
 
-import numpy as np
 import pytest
 import torch
 
 from benchmarks import speed
 
 pytestmark = pytest.mark.slow
-
-DI = speed.ROOT / "results" / "di" / "seeds" / "1.csv"
 
 
 @pytest.fixture
@@ -24,14 +20,13 @@ def small(monkeypatch):
 
 
 def test_a_script_is_measured(small):
-    """Parts are parts of the whole; the products alone take less than the epoch of which they are."""
-    figures = speed.measure("small", "plain", Namespace(threads=1, repeats=1, tf32=False, cuda=False))
+    """Parts are parts of the whole."""
+    figures = speed.measure("small", "plain", Namespace(repeats=1, tf32=False, cuda=False))
     rollout, epoch, update = (float(re.match(r"[0-9.]+", figures[key])[0]) for key in ("rollout", "epoch", "update"))
     assert rollout > 0 and epoch > 0 and update == pytest.approx(rollout + 8 * epoch, abs=0.02)
     parts = {name: float(seconds) for name, seconds in re.findall(r"(\w+) ([0-9.]+) s", figures["parts"])}
     assert 0 < parts["environment"] + parts["network"] <= parts["rollout"] < parts["update"]
     assert 0 < parts["gradients"] < parts["update"]
-    assert float(figures["rate"].split()[0]) < 1.1
 
 
 def test_gathered_windows_give_the_same_hidden_states(small):
@@ -50,33 +45,8 @@ def test_gathered_windows_give_the_same_hidden_states(small):
     assert (wrong - hidden[n, t]).abs().max() > 1e-3
 
 
-def test_a_line_sets_a_training_beside_the_shipped_run_after_as_many_updates(monkeypatch):
-    third = float(list(csv.DictReader(DI.open()))[2]["charts/SPS"])
-    curve = {speed.SPS: (np.array([1, 2, 3]), np.array([5.0, 6.0, 2 * third]))}
-    monkeypatch.setattr(speed, "curve_of", lambda training, seconds: curve)
-    training = speed.first_trainings()["results/di"]
-    name, fast, shipped, ratio, updates = speed.compare("results/di", training, 50).split()
-    assert (name, updates, ratio) == ("results/di", "3", "2.00")
-    assert float(fast) == pytest.approx(2 * third, abs=0.5) and float(shipped) == pytest.approx(third, abs=0.5)
-
-
-def test_a_training_is_started_and_its_folder_deleted():
-    before = set((speed.ROOT / "runs").glob("*"))
-    speed.curve_of(speed.first_trainings()["results/di"], seconds=1)
-    assert set((speed.ROOT / "runs").glob("*")) == before
-
-
-@pytest.mark.parametrize(
-    "argv, said",
-    [
-        (["trainings", "results/nothing"], "results/nothing must be among results/di"),
-        (["trainings", "results/di/"], "results/di made no update in 50 s"),
-        (["update", "huge"], "huge must be among tiny, di"),
-    ],
-)
-def test_refusals_are_one_line(argv, said, monkeypatch):
-    monkeypatch.setattr(speed, "curve_of", lambda training, seconds: {})
-    monkeypatch.setattr(sys, "argv", ["speed", *argv])
+def test_a_size_that_is_none_is_refused_in_one_line(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["speed", "update", "huge"])
     with pytest.raises(SystemExit) as end:
         speed.main()
-    assert str(end.value).startswith(f"error: {said}") and "\n" not in str(end.value)
+    assert str(end.value).startswith("error: huge must be among di, vdp") and "\n" not in str(end.value)
