@@ -114,11 +114,18 @@ class Vehicle:
             rows += [(start, dry, thrust, flow, 0), (dry, end, 0.0, 0.0, 0)]
         return rows
 
-    def derivative(self, t, s, u, thrust, flow):
+    def derivative(self, t, s, u, thrust, flow, drag_factor=1.0, wind=(0.0, 0.0)):
+        """Of the state; the wind blows towards east and north, at its most 12 km up."""
         x, y, z, vx, vy, vz, m = s
         r = math.sqrt(x * x + y * y + z * z)
         wx, wy, wz = vx + OMEGA * y, vy - OMEGA * x, vz  # v - omega x r
-        pressure = 0.5 * 1.225 * math.exp(-(r - RE) / 7200.0) * 0.5 * self.area
+        if any(wind):
+            east, north = (speed * math.exp(-(((r - RE - 12000) / 5000) ** 2)) for speed in wind)
+            level = math.hypot(x, y)
+            wx -= -east * y / level - north * z / r * x / level
+            wy -= east * x / level - north * z / r * y / level
+            wz -= north * level / r
+        pressure = 0.5 * 1.225 * math.exp(-(r - RE) / 7200.0) * 0.5 * self.area * drag_factor
         drag = pressure * math.sqrt(wx * wx + wy * wy + wz * wz)
         g = MU / r**3
         return [

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_hex
 
-import envs
 from drawing.animation import FRAMES, SIDES
 from landing import figures
 from landing.animation import descent_animation
@@ -160,18 +159,3 @@ def test_frames_of_the_single_environment():
     assert np.array_equal(env.render(), frames[-1]), "a look changes nothing"
     env.reset(seed=1)
     assert np.array_equal(env.render(), frames[0])
-
-
-@pytest.mark.parametrize("env_id", [ENV_ID, "PoweredDescent-v0"])
-def test_frames_of_the_batch_are_those_of_single_environments(env_id):
-    batch = gym.make_vec(env_id, num_envs=2, render_mode="rgb_array")
-    single = gym.make(env_id, render_mode="rgb_array")
-    assert env_id in envs.LANDERS
-    batch.reset(options={"draw": draws(3, 2)})
-    single.reset(options={"draw": draws(3, 2)[1]})
-    for _ in range(6):
-        batch.step(np.stack([-HOVER, HOVER]))
-        single.step(HOVER)
-    frames = batch.render()
-    assert len(frames) == 2 and (frames[0] != frames[1]).any()
-    assert np.array_equal(frames[1], single.render())

@@ -63,38 +63,17 @@ def test_batches_do_not_change_a_flight():
     assert parts["y"].shape[0] == KEPT_FLIGHTS
 
 
-def test_recorded_flights_can_be_flown_again():
-    """u, effectiveness, start and gravity alone: integrated by hand they end where final_y says."""
-    z = draws(2, 4)
-    commands = lambda obs, t: np.tile([0.05, -0.02, 0.45], (4, 1))  # noqa: E731
-    flown = fly_lander(ID, commands, z, failure_time="random", failure_probability=1.0)
-    for k in range(4):
-        r, v, m = np.split(flown["start"][k].copy(), [3, 6])
-        acts = np.isfinite(flown["u"][k, :, 0])
-        left = flown["final_time"][k]
-        for u, effectiveness in zip(flown["u"][k, acts], flown["effectiveness"][k, acts]):
-            thrust = u * effectiveness
-            thrust *= np.clip(np.linalg.norm(thrust), 4000, 24000) / np.linalg.norm(thrust)
-            h = min(left, 0.2) / 200
-            left -= 0.2
-            for _ in range(200):  # the midpoint rule
-                flow = np.linalg.norm(thrust) / (210 * 9.81)
-                a = thrust / (m - flow * h / 2) + flown["gravity"][k]
-                r, v, m = r + v * h + a * h * h / 2, v + a * h, m - flow * h
-        assert np.concatenate([r, v, m]) == pytest.approx(flown["final_y"][k], abs=1e-4)
-
-
 def test_the_optimum_lands_and_a_policy_is_measured_beside_it():
     task = task_of(ID)
     reference = task.optimum(3, 4)
     assert reference["solved"].all() and reference["down"].all()
     assert reference["position_error"].max() < 0.01 and reference["speed"].max() < 0.02
-    metrics, arrays = task.evaluate(falls, 3, 10, task.optimum(3, 10))
-    assert metrics["landed_rate"] == 0 and metrics["reference_starts"] == 10
+    metrics, arrays = task.evaluate(falls, 3, 4, reference)
+    assert metrics["landed_rate"] == 0 and metrics["reference_starts"] == 4
     assert all(np.isfinite(value) for value in metrics.values() if not isinstance(value, str))
     assert task.table(metrics).count("\n") > 10
     assert task.required_arrays(metrics) <= arrays.keys()
-    again = fly_lander(ID, held(arrays["u"], envs.MARS), draws(3, 10))
+    again = fly_lander(ID, held(arrays["u"], envs.MARS), draws(3, 4))
     assert again["final_y"] == pytest.approx(arrays["final_y"])
 
 
@@ -146,14 +125,13 @@ def test_the_curriculum_of_our_recipe():
         assert flown.speed_scale == pytest.approx(max(10 * std, 0.1))
         assert batch.dt == pytest.approx(hold)
         assert (flown.fuel_price, flown.slope_price) == (pytest.approx(fuel), pytest.approx(slope))
-    assert (flown.thrust_share, flown.start_spread, flown.wind, flown.failed_fuel_share) == (0.8, 1.9, 0.7, 0.3)
-    assert (flown.sink_rate, flown.aloft_price, flown.slope_height) == (0.8, 20.0, 10.0)
 
 
 def test_the_script_trains_evaluates_and_publishes(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    argv = ["--total-updates=2", "--num-envs=4", "--eval-every=1", "--eval-starts=10", "--failure-time=random"]
-    script.main(argv)
+    tiny = ["--embed-dim=8", "--num-heads=2", "--num-blocks=1", "--memory-length=4", "--mlp-dim=8", "--hidden-dim=8"]
+    argv = ["--total-updates=1", "--num-envs=4", "--eval-starts=10", "--failure-time=random"]
+    script.main([*tiny, *argv])
     (run,) = (tmp_path / "runs").iterdir()
     metrics, arrays = read_evaluation(run)
     assert metrics["failure_time"] == "random" and metrics["decision_s"] == 0.4
@@ -163,9 +141,6 @@ def test_the_script_trains_evaluates_and_publishes(tmp_path, monkeypatch, capsys
     )
     again = json.loads((tmp_path / "again.json").read_text())
     assert again["position_error_mean_m"] == metrics["position_error_mean_m"]
-    flags = ["--eval-only", "--eval-starts=10", "--eval-json=start.json", "--failure-time=start"]
-    script.main([f"--checkpoint={run / 'agent.safetensors'}", *flags])
-    assert json.loads((tmp_path / "start.json").read_text())["failure_time"] == "start"
     evaluate.publish(run, tmp_path / "results", ship=False)
     assert (tmp_path / "results" / "eval.npz").is_file()
     capsys.readouterr()

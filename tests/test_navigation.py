@@ -1,7 +1,6 @@
 """Navigation noise: its statistics, what it leaves alone, and the filter against closed forms, SciPy and its own P."""
 
 import copy
-import json
 import math
 from functools import partial
 
@@ -70,16 +69,18 @@ def test_noise_is_white_and_normal_with_the_sizes_given():
 
 
 def test_only_position_and_velocity_are_noisy_and_the_flight_is_exact():
-    """Equal states, rewards, draws and ends with the noise and without; the same directions flown."""
-    exact, noisy = (gym.make_vec(CUTOFF, num_envs=4, dispersion=1.0, navigation_noise=noise) for noise in (None, NOISE))
-    law = guidance.open_loop(CUTOFF)
+    """Equal states, rewards, draws and ends with the noise and without."""
+    exact, noisy = (make(4, noise, dispersion=1.0) for noise in (None, NOISE))
     pairs = [env.reset(seed=5)[0] for env in (exact, noisy)]
-    for t in range(485):  # beyond the first ends: other vehicles are drawn
+    ends = 0
+    for t in range(120):  # up, and down into the ground: other vehicles are drawn
         np.testing.assert_array_equal(exact.y, noisy.y)
         np.testing.assert_array_equal(exact.draw, noisy.draw)
         np.testing.assert_array_equal(pairs[0][:, 6:], pairs[1][:, 6:])
         assert (pairs[0][:, :6] != pairs[1][:, :6]).all()
-        stepped = [env.step(law(pairs[0], t)) for env in (exact, noisy)]
+        action = np.tile([1.0, 0.1, 0.0] if t < 20 else [-1.0, 0.1, 0.0], (4, 1))
+        stepped = [env.step(action) for env in (exact, noisy)]
+        ends += stepped[0][2].sum()
         pairs = [step[0] for step in stepped]
         np.testing.assert_array_equal(stepped[0][1], stepped[1][1])
         np.testing.assert_array_equal(stepped[0][2], stepped[1][2])
@@ -88,6 +89,7 @@ def test_only_position_and_velocity_are_noisy_and_the_flight_is_exact():
         if stepped[0][2].any():
             state = stepped[1][4]["final_info"]["final_y"][stepped[0][2]]
             np.testing.assert_array_equal(state[:, :6], stepped[0][4]["final_obs"][stepped[0][2], :6])
+    assert ends >= 4
 
 
 def test_noise_is_reproducible_by_seed_and_new_in_each_episode():
@@ -117,23 +119,6 @@ def test_noise_that_is_given_is_flown():
     for t in range(3):
         np.testing.assert_allclose(obs[:, :6] - env.y.T[:, :6], SIGMAS * scores[:, t], atol=1e-8)
         obs, *_ = env.step([UP, UP])
-
-
-def test_the_single_environment_and_the_batch_see_the_same():
-    single, batch = gym.make(CUTOFF, navigation_noise=NOISE), gym.make_vec(CUTOFF, num_envs=1, navigation_noise=NOISE)
-    np.testing.assert_array_equal(single.reset(seed=3)[0], batch.reset(seed=3)[0][0])
-    scores = np.ones((batch.episode_steps + 1, 6))
-    np.testing.assert_array_equal(single.reset(options={"noise": scores})[0][:3], batch.y[:3, 0] + 10)
-
-
-def test_a_stream_that_is_put_back_goes_on_with_the_same_noise():
-    """As a resume does: of a new batch, whatever its seed."""
-    env, other = make(2, dispersion=1.0), make(2, dispersion=1.0)
-    env.reset(seed=1)
-    other.reset(seed=9)
-    for name, stream in other.generators.items():
-        stream.bit_generator.state = json.loads(json.dumps(env.generators[name].bit_generator.state))
-    np.testing.assert_array_equal(env.reset()[0], other.reset()[0])
 
 
 # --- bad input --------------------------------------------------------------------------------------------------------
@@ -203,8 +188,6 @@ def test_an_evaluation_does_not_depend_on_its_batches():
     ends = [evaluate_dispersed(CUTOFF, law, 2, 6, 1.0, at_once, navigation_noise=NOISE)[1] for at_once in (6, 4)]
     for name, values in ends[0].items():
         np.testing.assert_array_equal(values, ends[1][name])
-    exact = evaluate_dispersed(CUTOFF, law, 2, 6, 1.0)[1]
-    assert (exact["final_error"] != ends[0]["final_error"]).any()
     energy = (ends[0]["final_y"][:, 3:6] ** 2).sum(axis=1) / 2 - envs.ROCKET.mu / np.linalg.norm(
         ends[0]["final_y"][:, :3], axis=1
     )
@@ -224,18 +207,6 @@ def test_metrics_have_the_noise_as_their_only_new_keys():
 
 
 # --- the filter -------------------------------------------------------------------------------------------------------
-
-
-def test_a_random_walk_is_filtered_as_the_closed_form_says():
-    """x' = x + w, z = x + v: P = (q + sqrt(q^2 + 4 q r)) / 2 before an observation, gain P / (P + r)."""
-    q, r = 0.3, 2.0
-    P, one = np.ones((1, 1, 1)), np.ones((1, 1, 1))
-    for _ in range(200):
-        before = kalman.predicted_covariance(P, one, q * one)
-        gain, P = kalman.corrected(before, np.array([[r]]))
-    steady = (q + np.sqrt(q**2 + 4 * q * r)) / 2
-    assert before.item() == pytest.approx(steady, rel=1e-12)
-    assert gain.item() == pytest.approx(steady / (steady + r), rel=1e-12)
 
 
 def test_the_gain_of_a_hidden_acceleration_is_that_of_the_riccati_equation():

@@ -64,7 +64,7 @@ def solve(z, failure_time="random", dispersion=0.0):
 @pytest.mark.slow
 def test_knowing_earlier_saves_what_another_program_says():
     """kg that the optimum saves that knows before lift-off; the pairs are of a script that shares nothing with ours."""
-    elsewhere = {(262.0, 0.15): 9.5, (300.0, 0.2): 19.0, (400.0, 0.25): 15.0}
+    elsewhere = {(262.0, 0.15): 9.5, (400.0, 0.25): 15.0}
     optima = solve(stage_2(*elsewhere))
     guess, (h, e) = guidance.optimum_guess(CUTOFF), target_orbit(ROCKET.target, ROCKET.mu)
     for ((moment, share), saves), optimum in zip(elsewhere.items(), optima):
@@ -81,10 +81,10 @@ def test_knowing_earlier_saves_what_another_program_says():
 
 @pytest.mark.slow
 def test_the_environment_flies_the_optimum():
-    """Failures of all engines in drawn vehicles and air: to the target, with its mass, healthy until the strike."""
-    z = draws(ROCKET, 1.0, 5, 4, 0.3)
+    """Failures of two engines in drawn vehicles and air: to the target, with its mass, healthy until the strike."""
+    z = draws(ROCKET, 1.0, 5, 2, 0.3)
     z[:, SCORES] = 0.0
-    z[:, SCORES + 1] = 0.1, 0.3, 0.6, 0.9
+    z[:, SCORES + 1] = 0.1, 0.6
     optima = solve(z, dispersion=1.0)
     times = guidance.middles(ROCKET)
     for row, optimum in zip(z, optima):
@@ -221,17 +221,17 @@ def test_what_is_stored_is_not_solved(no_solves, tmp_path):
 @pytest.mark.parametrize("failure_time", ["random", "ignition"])
 @pytest.mark.parametrize("env_id, failure", [(CUTOFF, 0.3), (CUTOFF, 0.25), ("TwoStageLEO-v0", 0.3)])
 def test_the_stored_optima_fit_today(env_id, failure, failure_time):
-    """All 1705 flights of eval seed 0, in files that are small; two of them solved again."""
+    """All 1705 flights of eval seed 0, in files that are small; one of them solved again."""
     rescue.known_optima.cache_clear()
     mission, failing = ROCKETS[env_id], Failing(1.0, failure, failure_time)
     known = rescue.stored_optima(rescue.about(env_id, mission, failing, 0), 1705)
     z = draws(mission.rocket, 1.0, 0, 1705, failure)
     has_failed = z[:, -4] < 0.5
     np.testing.assert_array_equal(np.isfinite(known.mass), has_failed)
-    some = np.flatnonzero(has_failed)[[3, 100]]
-    for k, optimum in zip(some, rescue.failing_optima(env_id, mission, failing, z[some], processes=1)):
-        assert optimum["final_mass"] == pytest.approx(known.mass[k], abs=1e-3)
-        np.testing.assert_allclose(optimum["orbit_price"], known.price[k], rtol=1e-3, atol=1.0)
+    k = np.flatnonzero(has_failed)[100]
+    (optimum,) = rescue.failing_optima(env_id, mission, failing, z[[k]], processes=1)
+    assert optimum["final_mass"] == pytest.approx(known.mass[k], abs=1e-3)
+    np.testing.assert_allclose(optimum["orbit_price"], known.price[k], rtol=1e-3, atol=1.0)
     assert sum(path.stat().st_size for path in rescue.STORED.glob("*")) < 200_000
 
 
@@ -323,9 +323,6 @@ def test_no_flight_ends_heavier_than_the_optimum_that_knows(flown):
     close = has_failed & (errors < 5e-3)
     short = (known.mass_at(arrays["final_error"], ROCKET) - arrays["final_y"][:, 6])[close]
     assert close.sum() > 2 and short.min() > -0.5 and metrics["failure_mass_short_mean_kg"] > 0
-    saved = has_failed & (known.mass > dry_mass) & (errors < 0.02)
-    short = (known.mass_at(arrays["final_error"], ROCKET) - arrays["final_y"][:, 6])[saved]
-    assert metrics["failure_mass_short_mean_kg"] == pytest.approx(short.mean(), rel=1e-9)
 
 
 @pytest.mark.slow
@@ -356,46 +353,22 @@ def test_failures_without_dispersion_have_no_dispersed_statistics(no_solves):
 
 
 @pytest.mark.slow
-def test_a_policy_with_memory_flies_as_long_as_its_flights_last(no_solves, tmp_path):
-    """Longer than any flight without a failure, for which 481 steps are enough; a shorter cache of keys ends it.
-
-    Before failures were an option, such a flight ended an evaluation with "The size of tensor a (32) must match the
-    size of tensor b (33)".
-    """
-    checkpoint = ROOT / "results" / "rocket_dispersed" / "agent.safetensors"
-    files = [f"--eval-json={tmp_path}/eval.json", f"--eval-npz={tmp_path}/eval.npz"]
-    argv = ["--eval-only", f"--checkpoint={checkpoint}", "--eval-starts=10", "--eval-seed=4", *files]
-    script().main([*argv, "--failure=0.3", "--failure-time=ignition"])
-    arrays = np.load(tmp_path / "eval.npz")
-    metrics = json.loads((tmp_path / "eval.json").read_text())
-    longest = longest_flight(dispersion=1.0)
-    assert arrays["final_t"].max() > 2 * longest + 50
-    assert metrics["failure_starts"] == (arrays["failure"][:, 0] >= 0).sum()
-    assert np.isfinite(arrays["final_error"]).all()
-
-    args = parse("--eval-only", f"--checkpoint={checkpoint}")
-    agent = script().Agent(args, envs.RocketVectorEnv(1, ROCKETS[CUTOFF]))
-    with pytest.raises(RuntimeError, match=r"must match the size of tensor b"):
-        evaluate_dispersed(CUTOFF, agent.make_policy(longest), 4, 10, 0.0, failure=0.3, failure_time="ignition")
-
-
-def longest_flight(**options):
-    """Of these options, in steps."""
-    return envs.RocketVectorEnv(1, ROCKETS[CUTOFF], **options).episode_steps
-
-
-@pytest.mark.slow
 def test_a_training_with_failures(no_solves, tmp_path, monkeypatch):
-    """Two updates; the evaluations on the way and at its end have their keys; the file says nothing of the failure."""
+    """The evaluation at its end has its keys; the file says nothing of the failure.
+
+    Its policy flies up. It remembers, so it has to be made for flights longer than any without a failure.
+    """
     monkeypatch.chdir(tmp_path)
     tiny = ["--embed-dim=8", "--num-heads=2", "--num-blocks=1", "--memory-length=4", "--mlp-dim=8", "--hidden-dim=8"]
-    flags = [f"--env-id={CUTOFF}", "--failure=0.2", "--total-updates=2", "--num-envs=4", "--eval-starts=10"]
-    script().main([*tiny, *flags, "--eval-every=1", "--flights-per-start=2"])
+    flags = [f"--env-id={CUTOFF}", "--dispersion=1", "--failure=0.3", "--failure-time=ignition", "--total-updates=1"]
+    script().main([*tiny, *flags, "--num-envs=2", "--eval-starts=10", "--eval-seed=4", "--update-epochs=1"])
     (run,) = (tmp_path / "runs").iterdir()
     metrics = json.loads((run / "eval.json").read_text())
-    assert metrics["failure"] == 0.2 and metrics["failure_starts"] > 0 and no_solves == [10, 10]
+    assert metrics["failure"] == 0.3 and metrics["failure_starts"] > 0 and no_solves == [10]
+    longest = envs.RocketVectorEnv(1, ROCKETS[CUTOFF], dispersion=1.0).episode_steps
+    assert np.load(run / "eval.npz")["final_t"].max() > 2 * longest + 50
     args = parse("--eval-only", f"--checkpoint={run}/agent.safetensors")
-    assert args.failure == 0.0 and args.failure_time == "random" and args.eval_starts == 1000
+    assert args.failure == 0.0 and args.eval_starts == 1000
 
 
 # --- flags ------------------------------------------------------------------------------------------------------------
@@ -412,7 +385,6 @@ def test_a_training_with_failures_begins_as_a_dispersed_one():
 @pytest.mark.parametrize(
     "argv, message",
     [
-        (["--failure=0.31"], "error: --failure 0.31: must be between 0.0 and 0.3"),
         (["--failure=0.1", "--failure-time=late"], "error: --failure-time late: must be one of random, ignition"),
         (["--failure=0.1", f"--env-id={FIXED}"], "error: --failure 0.1: must be 0 where flights end at a fixed time"),
         (["--failure=0.1", "--no-observe-phase", "--recipe=paper"], "error: --no-observe-phase: not in a training"),
@@ -462,7 +434,7 @@ def compared(tmp_path_factory):
         made, keep = [], comparison.Comparison.__init__
         patch.setattr(comparison.Comparison, "__init__", lambda self, *a, **k: made.append(self) or keep(self, *a, **k))
         rescue.known_optima.cache_clear()
-        comparison.compare(CUTOFF, folder, 1.0, 10, 5, 3, failure=0.2, failure_time="ignition")
+        comparison.compare(CUTOFF, folder, 1.0, 6, 3, 4, failure=0.2, failure_time="ignition")
         rescue.known_optima.cache_clear()
     return folder, made[0]
 
@@ -472,36 +444,20 @@ def test_opponents_meet_the_same_failures(compared):
     folder, flown = compared
     report = json.loads((folder / "opponents_at_ignition.json").read_text())
     assert (report["failure"], report["failure_time"]) == (0.2, "ignition")
-    z = draws(ROCKET, 1.0, 3, 10, 0.2)
+    z = draws(ROCKET, 1.0, 4, 6, 0.2)
     has_failed = z[:, SCORES] < 0.5
     for name, law in report["laws"].items():
-        n = 5 if name in (*comparison.REPLANS, "optimum") else 10
+        n = 3 if name in (*comparison.REPLANS, "optimum") else 6
         np.testing.assert_array_equal(flown.arrays[name]["draw"], z[:n])
         assert law["failure_starts"] == has_failed[:n].sum() and law["dispersed_starts"] == (~has_failed[:n]).sum()
-        assert law["first"]["failure_starts"] == has_failed[:5].sum()
+        assert law["first"]["failure_starts"] == has_failed[:3].sum()
         savable = [rows[name]["savable"] for label, rows in report["by_loss"].items() if " to " in label]
         assert sum(savable) == law["failure_savable"]
     best = report["laws"]["optimum"]
     assert best["failure_saved_rate"] == 1 and best["failure_error_p95"] < 2e-3
     assert best["failure_mass_short_mean_kg"] < report["laws"]["tvlqr_energy"]["failure_mass_short_mean_kg"]
     with np.load(folder / "opponents_at_ignition.npz") as file:
-        np.testing.assert_array_equal(np.isfinite(file["best_mass_kg"]), has_failed | (np.arange(10) < 5))
-
-
-@pytest.mark.parametrize(
-    "argv, line",
-    [
-        (["--failure=0.4"], "error: argument --failure: '0.4' must be a number from 0 to 0.3"),
-        (["--failure=0.1", "--failure-time=late"], "evaluate.py: failure_time is 'late'; it must be one of random"),
-    ],
-)
-def test_opponents_that_do_not_fit_are_one_line(monkeypatch, tmp_path, argv, line):
-    folder = shutil.copytree(ROOT / "results" / "rocket_cutoff", tmp_path / "rocket")
-    monkeypatch.setattr(comparison, "Comparison", None)  # nothing is flown
-    monkeypatch.setattr("sys.argv", ["evaluate.py", "opponents", str(folder), *argv])
-    with pytest.raises(SystemExit) as refusal:
-        evaluate.main()
-    assert str(refusal.value).startswith(line) and "\n" not in str(refusal.value)
+        np.testing.assert_array_equal(np.isfinite(file["best_mass_kg"]), has_failed | (np.arange(6) < 3))
 
 
 @pytest.mark.parametrize("flag", ["--dispersion=1", "--starts=5"])

@@ -96,10 +96,9 @@ def test_drag_costs_mass(command):
 
 
 def test_optimum_for_the_orbit_reached():
-    """For the target's own elements it is the known optimum; a lower apogee, with the same perigee, leaves more."""
-    elements = {"a_km": 24361.14, "e": 0.7308, "i_deg": 28.5, "raan_deg": 269.8, "argp_deg": 130.5}
-    assert optimum.reached_optimum(elements)["final_mass"] == pytest.approx(7529.712296, rel=1e-8)
-    lower = elements | {"a_km": 24361.14 - 100, "e": 1 - 24361.14 * (1 - 0.7308) / (24361.14 - 100)}
+    """A lower apogee, with the same perigee, leaves more than the target's 7529.7 kg."""
+    lower = {"a_km": 24361.14 - 100, "e": 1 - 24361.14 * (1 - 0.7308) / (24361.14 - 100)}
+    lower |= {"i_deg": 28.5, "raan_deg": 269.8, "argp_deg": 130.5}
     assert 7530 < optimum.reached_optimum(lower)["final_mass"] < 7550
 
 
@@ -121,6 +120,7 @@ def test_every_solve_is_ready_to_fly(command, flights):
         np.testing.assert_allclose(np.linalg.norm(u, axis=1), 1, atol=1e-12)
         np.testing.assert_allclose(flight["u"], u, atol=1e-12)
         assert flight["final_time_s"] == t[-1] == numbers[key]["final_time_s"] and not flight["crashed"]
+        assert (np.linalg.norm(flight["y"][1:, :3], axis=1) - ROCKET.Re).min() > 0, "none flies through the ground"
 
 
 def test_fixed_time_spends_all_and_stays_below_the_ceiling(command, flights):
@@ -144,11 +144,6 @@ def half_step(y, u):
     *_, thrust, flow, _ = ROCKET.arcs()[-1]
     y = rk4(dynamics, tuple(y), (*u, thrust, flow), 1.0)
     return (np.linalg.norm(y[:3]) - ROCKET.Re) / 1e3
-
-
-def test_no_ascent_flies_through_the_ground(flights):
-    for flight in flights.values():
-        assert (np.linalg.norm(flight["y"][1:, :3], axis=1) - ROCKET.Re).min() > 0
 
 
 # --- what evaluate.py takes -------------------------------------------------------------------------------------------
@@ -194,10 +189,6 @@ def flip_bits(folder):
     path.write_bytes(data)
 
 
-def break_json(folder):
-    (folder / "rocket_reference.json").write_text("[1, 2")
-
-
 def turn(folder):
     """Directions that no longer reach the target, as after a change of the dynamics."""
     with np.load(folder / "rocket_reference.npz") as file:
@@ -206,14 +197,7 @@ def turn(folder):
     np.savez_compressed(folder / "rocket_reference.npz", **arrays)
 
 
-def shorten(folder):
-    with np.load(folder / "rocket_reference.npz") as file:
-        arrays = dict(file)
-    arrays["free_u"] = arrays["free_u"][:100]
-    np.savez_compressed(folder / "rocket_reference.npz", **arrays)
-
-
-@pytest.mark.parametrize("damage", [drop_json, flip_bits, break_json, turn, shorten])
+@pytest.mark.parametrize("damage", [drop_json, flip_bits, turn])
 def test_reference_is_solved_anew_where_the_files_do_not_serve(command, flights, shipped, monkeypatch, damage):
     damage(shipped)
     before, solved = {path.name: path.read_bytes() for path in shipped.iterdir()}, []
@@ -279,15 +263,6 @@ def test_final_time_is_bounded_by_the_flights_end():
     assert optimum.optimise_ascent(case)["final_time"] == pytest.approx(924.1392, abs=1e-3)
 
 
-def test_ceiling_is_the_missions():
-    """With fixed time the reference stays below it; with cut-off, and without a ceiling, there is no bound."""
-    fixed, cutoff = ROCKETS["RocketAscent-v0"], ROCKETS["RocketAscentCutoff-v0"]
-    assert optimum.mission_case("fixed_capped", fixed) == ASCENTS["fixed_capped"]
-    assert optimum.mission_case("free", cutoff) == ASCENTS["free"]
-    assert optimum.mission_case("fixed", replace(fixed, ceiling_km=None)) == ASCENTS["fixed"]
-    assert optimum.mission_case("lower", replace(fixed, ceiling_km=240.0)).ceiling == 240e3
-
-
 @pytest.mark.parametrize("ceiling_km", [None, 260.0])
 def test_another_ceiling_is_another_reference(monkeypatch, flights, ceiling_km):
     """The paper's id with another ceiling, or none, does not find the stored optimum below 250 km."""
@@ -325,19 +300,16 @@ def test_options_change_what_is_solved(monkeypatch, flights):
 # --- failures ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "changes, names",
-    [({"payload": 30e3}, ["payload, 30000.0 kg"]), ({"raan": 244.5}, ["raan, 244.5 "])],
-)
-def test_an_infeasible_ascent_is_an_error_of_one_line(changes, names):
+def test_an_infeasible_ascent_is_an_error_of_one_line():
     """It says what to look at; 334.5108 is -arcsin(tan 28.5 / tan 51.6) in degrees."""
-    case = optimum.AscentCase("heavy", replace(LEO, **changes))
+    case = optimum.AscentCase("heavy", replace(LEO, payload=30e3, raan=244.5))
     with pytest.raises(RuntimeError) as error:
         optimum.optimise_ascent(case, 8)
     message = str(error.value)
     assert re.match("^rocket ascent heavy: IPOPT stopped with [A-Za-z_]+ after [0-9]+ s: ", message)
     hints = [
-        *names,
+        "payload, 30000.0 kg",
+        "raan, 244.5 ",
         "334.5108 towards the north and 205.4892 towards the south",
         "its i, 51.6",
         "its argp",
@@ -419,15 +391,15 @@ def test_an_orbit_before_the_last_burn_is_said_in_a_line():
 
 def test_a_solve_ends_in_its_seconds_and_is_heard_of(monkeypatch, capsys):
     """An argument of perigee that no ascent from this site can reach, with a second for all tries."""
-    monkeypatch.setitem(ipopt.limit, "seconds", 3)
-    monkeypatch.setattr(ipopt, "PATIENCE", 0.5)
+    monkeypatch.setitem(ipopt.limit, "seconds", 1)
+    monkeypatch.setattr(ipopt, "PATIENCE", 0.2)
     case = optimum.AscentCase("far", replace(ROCKET, argp=300.0, raan=90.0))
     begin = time.monotonic()
     message = "^rocket ascent far: not solved within . s .--solve-seconds.: .* at its raan, 90 degrees .*argp, 300 "
     with pytest.raises(NoOptimum, match=message):
         optimum.optimise_ascent(case)
     assert time.monotonic() - begin < 10
-    assert capsys.readouterr().err.splitlines() == ["rocket ascent far: IPOPT is still solving; it stops after 3 s"]
+    assert capsys.readouterr().err.splitlines() == ["rocket ascent far: IPOPT is still solving; it stops after 1 s"]
 
 
 def test_the_restart_of_the_page(monkeypatch):
