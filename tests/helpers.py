@@ -1,4 +1,4 @@
-"""What several test files use: a task's table, title and figures; a policy with random weights."""
+"""What several test files use: a tiny network, checked arguments; a task's table, title and figures."""
 
 import json
 
@@ -6,10 +6,18 @@ import gymnasium as gym
 import safetensors.torch
 import torch
 
+import runs
 from common.flags import plain_args
 from common.tasks import task_of
 
-SMALL = {"embed_dim": 8, "num_heads": 2, "mlp_dim": 12, "hidden_dim": 10}
+SMALL = {"embed_dim": 8, "num_heads": 2, "num_blocks": 1, "memory_length": 4, "mlp_dim": 12, "hidden_dim": 10}
+NETWORK = [f"--{name.replace('_', '-')}={value}" for name, value in SMALL.items()]
+TINY = [*NETWORK, "--num-envs=2", "--num-minibatches=2", "--update-epochs=2", "--eval-starts=10"]
+
+
+def parse(script, *argv):
+    """A script's checked arguments."""
+    return runs.parse_args(script, list(map(str, argv)))[0]
 
 
 def table_of(metrics):
@@ -29,7 +37,7 @@ def figure_of(name, arrays, metrics, curves=()):
 
 def save(script, folder, **changes):
     """A run folder's agent.safetensors with random weights: what starts as a constant is moved away from it."""
-    args = script.Args(**{**SMALL, "num_blocks": 1, "memory_length": 5, **changes})
+    args = script.Args(**{**SMALL, "memory_length": 5, **changes})
     options = {name: getattr(args, name) for name in script.ENV_OPTIONS} | script.FIXED_OPTIONS
     torch.manual_seed(0)
     agent = script.Agent(args, gym.make_vec(args.env_id, num_envs=1, **options))

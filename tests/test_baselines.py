@@ -21,7 +21,6 @@ from phased.optimum import guesses, hermite_simpson
 ROOT = Path(__file__).resolve().parents[1]
 KEYS = {"x", "u", "reward", "episodic_return", "cost", "cost_state", "cost_control", "cost_terminal", "hit"}
 KEYS |= {"terminal_error"}
-IN_THE_PLANE = [env_id for env_id, problem in PROBLEMS.items() if problem.weighted and problem.states == 2]
 
 
 def starts(n, seed=0):
@@ -110,14 +109,6 @@ def test_van_der_pol_numbers():
     assert weights @ optimum["cost"] == pytest.approx(11.792, abs=0.002)
     assert optimum["terminal_error"].max() == pytest.approx(0.0145, abs=1e-3) and optimum["hit"].all()
     assert optimum["replay_error"].max() < 1e-8 and KEYS <= set(optimum)
-
-
-def test_van_der_pol_optimum_cannot_be_improved_by_small_changes():
-    x0, rng = starts(20), np.random.default_rng(1)
-    optimum = reference("VanDerPol-v0", x0)
-    for size in (1e-3, 1e-2, 0.1):
-        u = np.clip(optimum["u"] + size * rng.standard_normal(optimum["u"].shape), -1.5, 1.5)
-        assert (flown("VanDerPol-v0", x0, u)["cost"] > optimum["cost"]).all()
 
 
 def test_collocation_and_linear_feedback_beside_the_optimum():
@@ -258,15 +249,6 @@ def test_unreachable_circle_falls_back_to_the_free_optimum(env_id, near, far):
     assert optimum["cost"][0] > optimum["cost_free"][0] and optimum["cost"][1] == optimum["cost_free"][1]
 
 
-@pytest.mark.parametrize("env_id", WAYPOINTS)
-def test_optimum_ends_on_the_edge_of_its_last_circle(env_id):
-    """From inside: never outside by the solver's tolerance."""
-    optimum = reference(env_id, starts(20, seed=3))
-    radius = PROBLEMS[env_id].phases[-1].radius
-    assert (optimum["terminal_error"][:, -1] <= radius).all()
-    np.testing.assert_allclose(optimum["terminal_error"][:, -1], radius, rtol=1e-8)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("env_id, phase", [
     ("DoubleIntegratorWaypoints-v0", 0),
@@ -315,16 +297,15 @@ def test_best_of_several_guesses_swings_a_pendulum_up(new_problem, hard_start):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("in_circles", [True])
 @pytest.mark.parametrize("built_in", ["VanDerPol-v0", "DoubleIntegratorWaypoints-v0"])
-def test_single_optimum_is_a_promise_that_is_kept(new_problem, built_in, in_circles):
+def test_single_optimum_is_a_promise_that_is_kept(new_problem, built_in):
     """More guesses find nothing better for the problems of the paper."""
-    env_id = new_problem(replace(PROBLEMS[built_in], env_id=f"Again-{in_circles}-{built_in}", single_optimum=False))
+    env_id = new_problem(replace(PROBLEMS[built_in], env_id=f"Again-{built_in}", single_optimum=False))
     count = lambda name: len(list(guesses(PROBLEMS[name], np.ones(2), np.zeros(0))))  # noqa: E731
     assert count(built_in) == 1 < count(env_id)
     x0 = np.vstack([starts(2), [[1.0, 1.0]]])
-    _, one, feasible, _ = optimise(built_in, x0, in_circles=in_circles)
-    _, several, _, _ = optimise(env_id, x0, in_circles=in_circles)
+    _, one, feasible, _ = optimise(built_in, x0, in_circles=True)
+    _, several, _, _ = optimise(env_id, x0, in_circles=True)
     assert feasible.all()
     np.testing.assert_allclose(several, one, rtol=1e-9)
 
@@ -355,18 +336,6 @@ def test_dynamics_that_are_not_analytic_are_linearised():
     A, _ = baselines.linearise(drag, (2.0, 1.5))
     assert A[1, 1] == pytest.approx(1 / (1 + 1.5 * 0.1) ** 2, abs=2e-5)
     assert A[1, 0] == 0 and A[0, 0] == pytest.approx(1, abs=1e-12)
-
-
-@pytest.mark.parametrize("env_id", IN_THE_PLANE)
-def test_every_problem_has_a_reference_that_is_flown(env_id):
-    problem = PROBLEMS[env_id]
-    x0 = baselines.starts(0, 2, problem.x0_max)
-    optimum = reference(env_id, x0)
-    assert KEYS <= set(optimum) and np.isfinite(optimum["cost"]).all()
-    np.testing.assert_array_equal(optimum["x"][:, 0], x0)
-    assert np.abs(optimum["u"]).max() <= problem.u_max
-    nothing = fly(env_id, lambda obs, t: np.zeros((2, 1)), x0)
-    assert (optimum["episodic_return"] >= nothing["episodic_return"]).all()
 
 
 # --- errors -----------------------------------------------------------------------------------------------------------
@@ -423,16 +392,16 @@ def run(folder, *arguments):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name, env_id, key", [
-    ("double-integrator", "DoubleIntegrator-v0", "K0_1"),
-    ("van-der-pol-waypoints", "VanDerPolWaypoints-v0", "circle_price_phase_3"),
-])  # fmt: skip
-def test_command_writes_what_it_prints(tmp_path, name, env_id, key):
+def test_command_writes_what_it_prints(tmp_path):
+    name, env_id = "van-der-pol-waypoints", "VanDerPolWaypoints-v0"
+    ended = run(tmp_path, name, "--starts", "0", "--json", "a.json")
+    assert ended.returncode == 1 and ended.stderr.count("\n") == 1 and ended.stdout == ""
+    assert not list(tmp_path.iterdir())
     ended = run(tmp_path, name, "--starts", "5", "--seed", "7", "--json", "a.json", "--npz", "a.npz")
     assert ended.returncode == 0 and ended.stderr == ""
     numbers = json.loads((tmp_path / "a.json").read_text())
     printed = dict(line.split() for line in ended.stdout.splitlines())
-    assert numbers["env_id"] == env_id and printed.keys() == numbers.keys() and key in numbers
+    assert numbers["env_id"] == env_id and printed.keys() == numbers.keys() and "circle_price_phase_3" in numbers
     assert all(isinstance(value, str | int | float) for value in numbers.values())
     assert float(printed["cost_mean"]) == pytest.approx(numbers["cost_mean"], rel=1e-6)
     with np.load(tmp_path / "a.npz") as arrays:
@@ -492,9 +461,3 @@ def test_bad_command_is_one_line(tmp_path, capsys, monkeypatch, arguments, messa
         baselines.parse_args([*arguments, "--json", "a.json"] if arguments else [])
     assert ended.value.code.startswith("error: ") and message in ended.value.code
     assert "\n" not in ended.value.code and capsys.readouterr().err == "" and not list(tmp_path.iterdir())
-
-
-def test_bad_command_ends_with_an_error_status(tmp_path):
-    ended = run(tmp_path, "van-der-pol", "--starts", "0", "--json", "a.json")
-    assert ended.returncode == 1 and ended.stderr.count("\n") == 1 and ended.stdout == ""
-    assert not list(tmp_path.iterdir())

@@ -3,6 +3,7 @@
 import gymnasium as gym
 import pytest
 import torch
+from helpers import SMALL
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 import cuda_graphs
@@ -10,7 +11,6 @@ import ppo_gtrxl_di
 import ppo_gtrxl_rocket
 
 torch.set_num_threads(1)
-TINY = {"embed_dim": 8, "num_heads": 2, "mlp_dim": 12, "hidden_dim": 10, "num_blocks": 2, "update_epochs": 2}
 
 
 class Graph:
@@ -56,7 +56,7 @@ def captured(monkeypatch):
 
 
 def new_agent(script, dtype=torch.float32, **changes):
-    args = script.Args(**{**TINY, **changes})
+    args = script.Args(**{**SMALL, "num_blocks": 2, "update_epochs": 2, **changes})
     torch.manual_seed(0)
     envs = gym.make_vec(args.env_id, num_envs=4)
     envs.reset(seed=0)

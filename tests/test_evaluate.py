@@ -20,9 +20,7 @@ from common.files import write_json, write_npz
 from drawing import animation
 from phased.metrics import cost_parts, near_origin_metrics, ratio_metrics
 
-IN_THE_PLANE = [env_id for env_id, problem in envs.PROBLEMS.items() if problem.weighted and problem.states == 2]
 SINGLE, WAYPOINTS = "DoubleIntegrator-v0", "DoubleIntegratorWaypoints-v0"
-IN_THE_PLANE = [env_id for env_id, problem in envs.PROBLEMS.items() if problem.weighted and problem.states == 2]
 
 # INTERFACE, "eval.json": all but what the script adds (seed, checkpoint_sha256, total_updates, ...)
 COMMON = {"env_id", "eval_seed", "eval_starts", "episodic_return", "reference_episodic_return"}
@@ -457,17 +455,9 @@ def test_seeds_alone_say_of_which_problem_a_folder_is(tmp_path):
     assert [path.name for path in other.parent.iterdir()] == ["2.json"]
 
 
-@pytest.mark.slow
 def test_shipping_another_seed_replaces_all_or_nothing(tmp_path, monkeypatch, capsys):
     first, second = make_run(tmp_path / "a", seed=1), make_run(tmp_path / "b", seed=2)
     results = tmp_path / "results" / "di"
-    monkeypatch.setattr(animation, "FRAMES", 3)
-    command_line(monkeypatch, capsys, "publish", first, results)
-    before = snapshot(results)
-    monkeypatch.setattr(evaluate, "animate", full_disk)
-    with pytest.raises(SystemExit, match="No space left"):
-        command_line(monkeypatch, capsys, "publish", second, results, "--ship")
-    assert snapshot(results) == before
 
     def draw(name):  # a stand-in for redraw and animate that shows of which policy it is
         def drawn(folder):
@@ -478,6 +468,13 @@ def test_shipping_another_seed_replaces_all_or_nothing(tmp_path, monkeypatch, ca
 
     for function, name in (("redraw", "training.png"), ("animate", "animation.gif")):
         monkeypatch.setattr(evaluate, function, draw(name))
+    command_line(monkeypatch, capsys, "publish", first, results)
+    before = snapshot(results)
+    with monkeypatch.context() as patch:
+        patch.setattr(evaluate, "animate", full_disk)
+        with pytest.raises(SystemExit, match="No space left"):
+            command_line(monkeypatch, capsys, "publish", second, results, "--ship")
+    assert snapshot(results) == before
     (results / "opponents.json").write_text("of seed 1")
     with monkeypatch.context() as patch:
         write = files.write_bytes

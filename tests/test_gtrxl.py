@@ -7,6 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from helpers import SMALL
 from scipy.special import erf
 from torch.utils.flop_counter import FlopCounterMode
 
@@ -18,7 +19,7 @@ TOLERANCE = {torch.float64: 1e-9, torch.float32: 1e-5}
 
 def make_agent(dtype=torch.float64, envs=None, plain=False, **sizes):
     """A small agent. Unless `plain`, what starts as a constant (R, biases, norms) is moved away from it."""
-    args = script.Args(**{"embed_dim": 8, "num_heads": 2, "mlp_dim": 12, "hidden_dim": 10, "num_blocks": 2, **sizes})
+    args = script.Args(**{**SMALL, "num_blocks": 2, **sizes})
     torch.manual_seed(0)
     agent = script.Agent(args, envs or gym.make_vec(args.env_id, num_envs=1)).to(dtype)
     if not plain:
@@ -49,8 +50,7 @@ def array(tensor):
 # --- rollout = training -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("dtype", TOLERANCE, ids=str)
-@pytest.mark.parametrize("num_blocks", [0, 1, 3])
+@pytest.mark.parametrize("dtype, num_blocks", [(torch.float64, 0), (torch.float64, 3), (torch.float32, 1)], ids=str)
 @pytest.mark.parametrize("T, L", [(3, 8), (8, 8), (1, 4), (80, 8), (80, 20), (133, 20), (150, 160), (5, 0), (80, 0)])
 def test_cache_and_parallel_pass_agree(dtype, num_blocks, T, L):
     """T shorter than, equal to and longer than L, and not a multiple of the chunk (of at most max(L / 2, 64) steps)."""
@@ -92,31 +92,6 @@ def test_memory_is_noise_of_the_given_spread():
     assert memory.std().item() == pytest.approx(0.1, rel=0.02) and abs(memory.mean().item()) < 2e-3
     assert memory.unique().numel() > 0.99 * memory.numel()  # its own draw for each block, episode, slot and entry
     assert not agent.new_memory(2, noise=0.0).any()
-
-
-# --- receptive field --------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("encode", [script.Agent.encode, encode_stepwise], ids=["parallel", "stepwise"])
-def test_receptive_field(encode):
-    """Through two blocks an observation reaches 2 L steps ahead and not one further, and never back."""
-    L, T, changed = 5, 64, 21
-    agent = make_agent(memory_length=L, num_blocks=2)
-    obs, memory = episodes(agent, 2, T)
-    other = obs.clone()
-    other[:, changed] += 1.0
-    moved = (encode(agent, obs, memory) != encode(agent, other, memory)).any(-1)
-    steps = torch.arange(T)
-    reached = (steps >= changed) & (steps <= changed + 2 * L)
-    torch.testing.assert_close(moved, reached.expand(2, T))
-
-
-def test_memory_is_out_of_sight_after_its_length():
-    """Slots before the start are seen by steps 0..L-1 of the first block only."""
-    agent = make_agent(memory_length=5, num_blocks=1)
-    obs, memory = episodes(agent, 1, 40)
-    moved = (agent.encode(obs, memory) != agent.encode(obs, memory + 1.0)).any(-1)[0]
-    torch.testing.assert_close(moved, torch.arange(40) < 5)
 
 
 # --- the paper's equations, in NumPy ----------------------------------------------------------------------------------
@@ -167,8 +142,9 @@ def naive_block(block, x, attended):
     return naive_gate(block.gate2, h1, naive_norm(block.norm2, h1 + mlp))
 
 
-@pytest.mark.parametrize("num_heads", [1, 2, 4])
-@pytest.mark.parametrize("T, L", [(1, 3), (5, 3), (3, 5), (80, 3), (135, 18), (150, 160), (80, 0)])
+@pytest.mark.parametrize(
+    "num_heads, T, L", [(1, 1, 3), (2, 5, 3), (4, 3, 5), (4, 80, 3), (2, 135, 18), (1, 70, 132), (2, 80, 0)]
+)
 def test_attention_is_the_papers_equation(num_heads, T, L):
     attention = make_agent(num_heads=num_heads, memory_length=L).blocks[0].attention
     x, memory = torch.randn(2, T, 8, dtype=torch.float64), torch.randn(2, L, 8, dtype=torch.float64)
@@ -194,18 +170,6 @@ def test_whole_network_is_encoder_blocks_and_heads():
     mean, value = (naive_linear(head[2], gelu(naive_linear(head[0], x))) for head in (agent.actor, agent.critic))
     np.testing.assert_allclose(array(agent.get_mean_action(hidden)), 3.0 * mean, atol=1e-12)
     np.testing.assert_allclose(array(agent.critic(hidden)), value, atol=1e-12)
-
-
-def test_gate_at_infinite_bias():
-    """b_g -> +inf passes x, -inf passes y; both gates at +inf make the block the identity."""
-    block = make_agent().blocks[0]
-    x, y = torch.randn(2, 4, 7, 8, dtype=torch.float64)
-    for bias, passed in ((torch.inf, x), (-torch.inf, y)):
-        torch.nn.init.constant_(block.gate1.linear.bias, bias)
-        torch.testing.assert_close(block.gate1(x, y), passed, rtol=0, atol=0)
-    for gate in (block.gate1, block.gate2):
-        torch.nn.init.constant_(gate.linear.bias, torch.inf)
-    torch.testing.assert_close(block(x, y), x, rtol=0, atol=0)
 
 
 # --- initialisation ---------------------------------------------------------------------------------------------------

@@ -114,8 +114,11 @@ def test_what_a_training_hands_over_is_checked(env_id):
     for env in (make(env_id, 2), gym.make(env_id)):
         with pytest.raises(BadInput, match="^training's flights_per_stat is 2; it must be one of flights_per_start"):
             env.reset(options={"training": {"flights_per_stat": 2}})
-        with pytest.raises(BadInput, match="^training's flights_per_start is 0; it must be a whole number of at least"):
-            env.reset(options={"training": {"flights_per_start": 0}})
+        for bad in (0, 1.5):
+            with pytest.raises(
+                BadInput, match=f"^training's flights_per_start is {bad}; it must be a whole number of at"
+            ):
+                env.reset(options={"training": {"flights_per_start": bad}})
         batch = getattr(env.unwrapped, "batch", env.unwrapped)
         for options, held in (({"training": {"flights_per_start": 2}}, 2), (None, 1)):
             env.reset(seed=0, options=options)

@@ -7,27 +7,25 @@ import socket
 import subprocess
 import sys
 import time
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 import torch.distributed as dist
-import torch.multiprocessing as multiprocessing
 from conftest import UnevenEnvs, update
+from helpers import NETWORK, SMALL, parse
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 import ppo_gtrxl_di as script
 import runs
+from benchmarks.robustness import PROCESSES
 from common.schedule import Schedule
 
 pytestmark = pytest.mark.slow
 
-ROOT = Path(__file__).parent.parent
 LENGTHS = [6, 2, 5, 1, 6, 3, 4, 6]  # the first half flies 14 steps, the second 19: means over ranks would be wrong
-SIZES = {"embed_dim": 8, "num_heads": 2, "num_blocks": 1, "memory_length": 4, "mlp_dim": 8, "hidden_dim": 8}
-NETWORK = [f"--{name.replace('_', '-')}={value}" for name, value in SIZES.items()]
+FLAGS = [*NETWORK, "--num-envs=5", "--num-minibatches=2", "--update-epochs=2", "--eval-starts=10", "--eval-every=0"]
 
 
 def batch_of(envs, agent):
@@ -40,13 +38,13 @@ def share(batch, episodes):
     return script.Batch(*(getattr(batch, name)[:, episodes].clone() for name in list(vars(batch))[:7]))
 
 
-def learn(rank, world, folder, settings, meeting=None):
-    """One update of this rank's half of the episodes; saves what came of it. The ranks meet there, or in the folder."""
+def learn(rank, world, folder, settings):
+    """One update of this rank's half of the episodes; saves what came of it. The ranks meet in the folder."""
     torch.set_num_threads(1)
     if world > 1:
-        dist.init_process_group("gloo", init_method=meeting or f"file://{folder}/meet", rank=rank, world_size=world)
+        dist.init_process_group("gloo", init_method=f"file://{folder}/meet", rank=rank, world_size=world)
     settings = {"learning_rate": 1e-3, **settings}
-    args = script.Args(**SIZES, num_minibatches=2, update_epochs=2, **settings)
+    args = script.Args(**SMALL, num_minibatches=2, update_epochs=2, **settings)
     envs = UnevenEnvs(LENGTHS)
     envs.num_envs, envs.flights_per_start = len(LENGTHS) // world, round(args.flights_per_start.at(0.0))
     torch.manual_seed(0)
@@ -84,31 +82,18 @@ def learn(rank, world, folder, settings, meeting=None):
     ids=["plain", "groups", "kl_stop"],
 )
 def test_two_processes_learn_what_one_does(tmp_path, settings):
-    save_batch(tmp_path)
-    for world in (1, 2):
-        start_ranks(tmp_path, world, settings)
-    check_against_one_process(tmp_path, settings)
-
-
-def save_batch(folder):
-    """The episodes that all of them learn from."""
+    """Gradients, weights, losses, advantages."""
     torch.manual_seed(0)
-    args, envs = script.Args(**SIZES), UnevenEnvs(LENGTHS)
-    torch.save(batch_of(envs, script.Agent(args, envs))[0], folder / "batch.pt")
-
-
-def start_ranks(folder, world, settings):
-    """`learn` in so many processes, to their ends."""
-    context = multiprocessing.get_context("forkserver")
-    ranks = [context.Process(target=learn, args=(rank, world, str(folder), settings)) for rank in range(world)]
-    [process.start() for process in ranks]
-    [process.join(120) for process in ranks]
-    assert [process.exitcode for process in ranks] == [0] * world
-
-
-def check_against_one_process(folder, settings):
-    """What the two ranks learned is what one process did: gradients, weights, losses, advantages."""
-    one, first, second = (torch.load(folder / f"{name}.pt") for name in ("1_0", "2_0", "2_1"))
+    args, envs = script.Args(**SMALL), UnevenEnvs(LENGTHS)
+    torch.save(batch_of(envs, script.Agent(args, envs))[0], tmp_path / "batch.pt")
+    ranks = [(rank, world, str(tmp_path), settings) for rank, world in ((0, 1), (0, 2), (1, 2))]
+    processes = [PROCESSES.Process(target=learn, args=rank) for rank in ranks]
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join(120)
+    assert [process.exitcode for process in processes] == [0, 0, 0]
+    one, first, second = (torch.load(tmp_path / f"{name}.pt") for name in ("1_0", "2_0", "2_1"))
     assert len(one["gradients"]) == len(first["gradients"]) == len(second["gradients"])
     assert len(one["gradients"]) == 4 if "target_kl" not in settings else 1 <= len(one["gradients"]) < 4
     for gradient, *others in zip(one["gradients"], first["gradients"], second["gradients"]):
@@ -126,16 +111,30 @@ def check_against_one_process(folder, settings):
 # --- torchrun ---------------------------------------------------------------------------------------------------------
 
 
-def torchrun(folder, *argv, wait=True):
-    """Start the script in two processes."""
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
+def torchrun(folder, *words):
+    """Start torchrun in this folder."""
+    command = [sys.executable, "-m", "torch.distributed.run", *map(str, words)]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     streams = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-    process = subprocess.Popen([*command, script.__file__, *argv], cwd=folder, env=environment, **streams)
-    if wait:
-        output, _ = process.communicate(timeout=120)
-        assert process.returncode == 0, output
-    return process
+    return subprocess.Popen(command, cwd=folder, env=environment, **streams)
+
+
+def two_processes(folder, *argv):
+    """Start the script in two processes of one machine."""
+    return torchrun(folder, "--standalone", "--nproc_per_node=2", script.__file__, *argv)
+
+
+def ended_well(process):
+    output, _ = process.communicate(timeout=120)
+    assert process.returncode == 0, output
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The training state of a run of two processes in one go."""
+    folder = tmp_path_factory.mktemp("whole")
+    ended_well(two_processes(folder, *FLAGS, "--total-updates=20"))
+    return state_in(folder)
 
 
 # --- several machines: torchrun's agents that meet over TCP, here on the loopback -------------------------------------
@@ -147,19 +146,15 @@ def free_port():
         return asked.getsockname()[1]
 
 
-def two_machines(folders, program, *argv, rendezvous):
+def two_machines(folders, *argv, rendezvous):
     """Start torchrun in each folder, as on a machine of its own with one process; returns both agents."""
-    command = [sys.executable, "-m", "torch.distributed.run", "--nnodes=2", "--nproc_per_node=1"]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
-    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
     port, agents = free_port(), []
     for rank, folder in enumerate(folders):
         if rendezvous == "static":
             meet = [f"--node-rank={rank}", "--master-addr=127.0.0.1", f"--master-port={port}"]
         else:
             meet = ["--rdzv-backend=c10d", f"--rdzv-endpoint=127.0.0.1:{port}", "--rdzv-id=test"]
-        words = [*command, *meet, str(program), *map(str, argv)]
-        agents.append(subprocess.Popen(words, cwd=folder, env=environment, **streams))
+        agents.append(torchrun(folder, "--nnodes=2", "--nproc_per_node=1", *meet, script.__file__, *argv))
     return agents
 
 
@@ -167,15 +162,6 @@ def ends_of(agents, timeout=300):
     """Exit statuses and outputs of both agents."""
     outputs = [agent.communicate(timeout=timeout)[0] for agent in agents]
     return [agent.returncode for agent in agents], outputs
-
-
-def test_two_machines_learn_what_one_process_does(tmp_path):
-    save_batch(tmp_path)
-    start_ranks(tmp_path, 1, {})
-    agents = two_machines([tmp_path, tmp_path], Path(__file__), tmp_path, rendezvous="c10d")
-    statuses, outputs = ends_of(agents)
-    assert statuses == [0, 0], outputs
-    check_against_one_process(tmp_path, {})
 
 
 def folders_of(tmp_path, *names):
@@ -192,24 +178,24 @@ def state_in(folder):
     return torch.load(run / "training_state.pt", weights_only=True)
 
 
-def test_two_machines_train_as_two_processes_of_one(tmp_path):
-    """The script's run, to the last bit; its folder is on the first machine alone."""
-    argv = [*NETWORK, "--num-envs=5", "--num-minibatches=2", "--eval-starts=10", "--total-updates=3", "--eval-every=0"]
-    alone, first, second = folders_of(tmp_path, "alone", "first", "second")
-    torchrun(alone, *argv)
-    statuses, outputs = ends_of(two_machines([first, second], script.__file__, *argv, rendezvous="static"))
+def test_two_machines_train_as_two_processes_of_one(tmp_path, whole):
+    """The script's run, to the last bit; its folder is on one machine alone."""
+    folders = folders_of(tmp_path, "first", "second")
+    statuses, outputs = ends_of(two_machines(folders, *FLAGS, "--total-updates=20", rendezvous="c10d"))
     assert statuses == [0, 0], outputs
-    assert not list(second.iterdir())
-    here, there = state_in(alone), state_in(first)
+    (folder,) = [folder for folder in folders if list(folder.iterdir())]  # the agents agree on who is first
+    assert_same_weights(state_in(folder), whole)
+
+
+def assert_same_weights(one, other):
     for part in ("agent", "average"):
-        torch.testing.assert_close(there[part], here[part], rtol=0, atol=0)
+        torch.testing.assert_close(one[part], other[part], rtol=0, atol=0)
 
 
 def test_a_machine_that_dies_ends_the_other(tmp_path):
     """The second one is killed, agent and worker; the first one fails within 60 s and keeps its last checkpoint."""
-    argv = [*NETWORK, "--num-envs=5", "--num-minibatches=2", "--total-updates=100000", "--eval-every=0"]
     folders = folders_of(tmp_path, "first", "second")
-    agents = two_machines(folders, script.__file__, *argv, "--eval-starts=10", rendezvous="static")
+    agents = two_machines(folders, *FLAGS, "--total-updates=100000", rendezvous="static")
     while not list(folders[0].glob("runs/*/agent.safetensors")):
         assert all(agent.poll() is None for agent in agents), ends_of(agents)
         time.sleep(0.05)
@@ -231,31 +217,21 @@ def children(pid):
     return [int(child) for child in found.stdout.split()]
 
 
-def test_torchrun_death_and_resume(tmp_path):
+def test_torchrun_death_and_resume(tmp_path, whole):
     """A worker that is killed ends both within 60 s; resumed, the run has the bits of the uninterrupted one."""
-    argv = [*NETWORK, "--num-envs=5", "--num-minibatches=2", "--update-epochs=2", "--eval-starts=10"]
-    argv += ["--total-updates=40", "--eval-every=0"]
-    states = []
-    for name in ("whole", "killed"):
-        folder = tmp_path / name
-        folder.mkdir()
-        process = torchrun(folder, *argv, wait=name == "whole")
-        if name == "killed":
-            while process.poll() is None and not list(folder.glob("runs/*/agent.safetensors")):
-                time.sleep(0.02)
-            killed = time.time()
-            os.kill(children(process.pid)[-1], signal.SIGKILL)
-            output, _ = process.communicate(timeout=60)
-            assert process.returncode != 0 and time.time() - killed < 60, output
-            assert not list(folder.glob("runs/*/eval.json")), "it ended before it was killed"
-            torchrun(folder, f"--resume={next(folder.glob('runs/*'))}")
-        (run,) = (folder / "runs").iterdir()
-        assert len(list(run.glob("eval.json"))) == 1
-        states.append(torch.load(run / "training_state.pt", weights_only=True))
-    whole, resumed = states
-    assert whole["progress"]["global_step"] == resumed["progress"]["global_step"] == 40 * 5 * 50
-    for part in ("agent", "average"):
-        torch.testing.assert_close(resumed[part], whole[part], rtol=0, atol=0)
+    process = two_processes(tmp_path, *FLAGS, "--total-updates=20")
+    while process.poll() is None and not list(tmp_path.glob("runs/*/agent.safetensors")):
+        time.sleep(0.02)
+    killed = time.time()
+    os.kill(children(process.pid)[-1], signal.SIGKILL)
+    output, _ = process.communicate(timeout=60)
+    assert process.returncode != 0 and time.time() - killed < 60, output
+    (run,) = tmp_path.glob("runs/*")
+    assert not (run / "eval.json").exists(), "it ended before it was killed"
+    ended_well(two_processes(tmp_path, f"--resume={run}"))
+    resumed = state_in(tmp_path)
+    assert whole["progress"]["global_step"] == resumed["progress"]["global_step"] == 20 * 5 * 50
+    assert_same_weights(resumed, whole)
     assert len(whole["rng"]) == 2 and not torch.equal(whole["rng"][0]["torch"], whole["rng"][1]["torch"])
     with pytest.raises(SystemExit, match="it was trained by 2 processes"):
         script.main([f"--resume={run}"])
@@ -272,10 +248,6 @@ def test_processes_draw_other_noise(monkeypatch):
     assert not (drawn[0] == drawn[1]).any()
 
 
-def parse(*argv):
-    return runs.parse_args(script, argv)[0]
-
-
 def test_processes_fly_starts_of_their_own(monkeypatch):
     starts = []
     for rank in (0, 1):
@@ -288,24 +260,24 @@ def test_processes_fly_starts_of_their_own(monkeypatch):
 def test_more_processes_than_environments(monkeypatch):
     monkeypatch.setenv("WORLD_SIZE", "4")
     with pytest.raises(SystemExit, match="--num-envs 3: must be at least the number of processes, 4"):
-        parse("--num-envs=3")
+        parse(script, "--num-envs=3")
     with pytest.raises(SystemExit, match=r"--num-minibatches 3: must be at most --num-envs 8 / 4 processes"):
-        parse("--num-envs=8", "--num-minibatches=3")
-    assert parse("--num-envs=8").num_minibatches == 2
+        parse(script, "--num-envs=8", "--num-minibatches=3")
+    assert parse(script, "--num-envs=8").num_minibatches == 2
 
 
 def test_every_process_flies_whole_groups(monkeypatch):
     monkeypatch.setenv("WORLD_SIZE", "2")
     with pytest.raises(SystemExit, match="--flights-per-start 4: must divide --num-envs 12 / 2 processes"):
-        parse("--num-envs=12", "--flights-per-start=4")
-    assert parse("--num-envs=12", "--flights-per-start=3").flights_per_start == Schedule(3)
+        parse(script, "--num-envs=12", "--flights-per-start=4")
+    assert parse(script, "--num-envs=12", "--flights-per-start=3").flights_per_start == Schedule(3)
 
 
 def test_shares_of_different_sizes(monkeypatch):
     """Without groups three and two environments are as good as any."""
     monkeypatch.setenv("WORLD_SIZE", "2")
-    assert parse("--num-envs=5", "--recipe=paper").flights_per_start == Schedule(1)
-    assert str(parse("--num-envs=5").flights_per_start) == "0:1 0.4:1 0.4:1"  # lowered from 8
+    assert parse(script, "--num-envs=5", "--recipe=paper").flights_per_start == Schedule(1)
+    assert str(parse(script, "--num-envs=5").flights_per_start) == "0:1 0.4:1 0.4:1"  # lowered from 8
 
 
 def test_moments_are_those_of_the_living(monkeypatch):
@@ -314,7 +286,3 @@ def test_moments_are_those_of_the_living(monkeypatch):
     mean, variance = script.moments(torch.tensor(x), torch.tensor(alive), (0, 1))
     living = copy.copy(x[alive > 0])
     assert (mean.item(), variance.item()) == pytest.approx((living.mean(), living.var()))
-
-
-if __name__ == "__main__":  # a rank that torchrun started, of `test_two_machines_learn_what_one_process_does`
-    learn(int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"]), sys.argv[1], {}, meeting="env://")
