@@ -98,14 +98,14 @@ def kill_and_resume(kills, seed=0):
     argv = [*TINY, "--total-updates=12"]
     for _ in range(2):  # the first one also starts the fork server
         with tempfile.TemporaryDirectory() as folder:
-            before = time.time()
+            before = time.monotonic()
             expected = finish(Path(folder), *argv)
-            seconds = time.time() - before
+            seconds = time.monotonic() - before
     for kill in range(kills):
         with tempfile.TemporaryDirectory() as name:
             folder = Path(name)
             process = start(folder, *argv, slow_disk=kill % 2)
-            began = time.time()
+            began = time.monotonic()
             written = f"runs/*/.{rng.choice(['training_state.pt', 'agent.safetensors'])}.*"
             moment = rng.uniform()
             process.join(seconds * moment)
@@ -114,7 +114,7 @@ def kill_and_resume(kills, seed=0):
             if process.is_alive():
                 os.kill(process.pid, signal.SIGKILL)
             else:
-                seconds = time.time() - began  # the machine has become less busy
+                seconds = time.monotonic() - began  # the machine has become less busy
             process.join()
             saved = list(folder.glob("runs/*/training_state.pt"))
             kind = "after its end" if process.exitcode == 0 else "in a write" if kill % 2 else "at random"
