@@ -29,7 +29,7 @@ from pkgutil import resolve_name
 
 import numpy as np
 
-from common.command_line import OneLineParser, integer, output_file
+from common.command_line import OneLineParser, integer, output_file, typed_command
 from common.errors import BadInput, NoOptimum
 from common.files import replacing, write_npz
 from common.ipopt import limit
@@ -442,7 +442,7 @@ def parse_args(argv=None):
         )
     argv = sys.argv[1:] if argv is None else argv
     if argv and not argv[0].startswith("-") and argv[0] not in commands.choices:
-        sys.exit(f"error: {argv[0]!r} is no id here; python baselines.py --help lists them")
+        sys.exit(f"error: {argv[0]!r} is no id here; {typed_command('baselines.py', '--help')} lists them")
     return parser.parse_args(argv)
 
 

@@ -1,6 +1,7 @@
 """A policy against the optimum: `evaluate`, and the results folders. This module imports neither torch nor a script.
 
-    python evaluate.py publish RUN_DIR results/di     # add a run to a results folder (--ship: make it the shipped one)
+    python evaluate.py publish RUN_DIR results/di     # add a run to a results folder (--ship: make it the shipped one;
+                                                      # --replace: in place of an older run of its seed)
     python evaluate.py shorten RUN_DIR                # half the bytes: RUN_DIR/bfloat16 can be published instead
     python evaluate.py figures results/di             # redraw its figures and print its table (a run folder works too)
     python evaluate.py animate results/di             # and its figures/animation.gif
@@ -21,13 +22,14 @@ from pathlib import Path
 import numpy as np
 
 import envs  # noqa: F401 - makes every id known to `task_of`
-from common.checkpoints import read_checkpoint, write_bfloat16
+from common.checkpoints import read_checkpoint, read_record, write_bfloat16
 from common.command_line import OneLineParser, integer, named_path, number, output_file, positive, utc
 from common.curves import evaluated, read_csv, read_curve, write_csv
 from common.errors import BadInput
-from common.evaluations import read_evaluation, read_json, read_metrics, refuse_another_policy
+from common.evaluations import first_edited, read_evaluation, read_json, read_metrics, refuse_another_policy
 from common.files import read_npz, write_bytes, write_npz
 from common.policies import evaluate_by_script, script_of
+from common.schedule import Schedule
 from common.tasks import task_of
 from exports.folders import EPOCH, LAUNCH_LONGITUDE, export, page
 
@@ -47,31 +49,43 @@ def evaluate(env_id: str, policy, eval_seed: int, n: int, reference: dict | None
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def publish(run_dir, folder, ship: bool = False, numbers: bool = False):
+# arguments in which the runs of a results folder may differ: their seed, the machine, and what is shown on the way
+OWN_ARGUMENTS = {
+    *("seed", "exp_name", "resume", "save_model", "capture_video", "eval_every", "eval_only", "eval_json", "eval_npz"),
+    *("cuda", "num_threads", "torch_deterministic", "torch_compile", "track", "wandb_project_name", "wandb_entity"),
+}
+
+
+def publish(run_dir, folder, ship: bool = False, numbers: bool = False, replace: bool = False):
     """Add a run to a results folder: its eval.json and training curve under seeds/, and the policy if it is shipped.
 
     The policy, its evaluation and the figures are replaced only if the folder ships no policy, or with `ship`. With
     `numbers` the folder gets only seeds/, and a curve has only the updates that were evaluated. The folder may keep a
     part of the flights, but its figures show all.
 
+    A run of a seed that is there is refused without `replace`. So is a run that does not belong to the folder's others:
+    of another problem, with other arguments (but for OWN_ARGUMENTS), or of a problem that has been edited since.
+
     Raises OSError or ValueError that says what is missing or does not fit. Then nothing has been written. All files are
     made first, and seeds/<seed>.json is written last. So if it is there, the rest is there, too.
     """
     run_dir, folder = Path(run_dir), Path(folder)
+    seed = read_json(run_dir / "eval.json")["seed"]
+    refuse_strangers(run_dir, folder, seed)
     metrics, _ = read_evaluation(run_dir)
     refuse_another_policy(run_dir, metrics)
     curve = read_curve(run_dir)
     if not curve:
         raise ValueError(f"{run_dir} has no TensorBoard scalars")
     shipped = read_metrics(folder / "eval.json") if (folder / "eval.json").exists() else None
-    for path in [*folder.glob("eval.json"), *(folder / "seeds").glob("*.json")]:
-        other = read_json(path)["env_id"]
-        if other != metrics["env_id"]:
-            raise ValueError(f"env_id of {run_dir} is {metrics['env_id']}; it must be {other}, as in {path}")
-    if shipped and not ship and shipped["seed"] == metrics["seed"]:
-        raise ValueError(f"{folder} already ships seed {metrics['seed']}; --ship replaces it")
-    seed = metrics["seed"]
-    ships = (ship or not shipped) and not numbers
+    is_shipped = shipped is not None and shipped["seed"] == seed
+    if is_shipped and not ship and not replace:
+        raise ValueError(f"{folder} already ships seed {seed}; --ship or --replace replaces it")
+    there = folder / "seeds" / f"{seed}.json"
+    is_another = there.exists() and not (ship and there.read_bytes() == (run_dir / "eval.json").read_bytes())
+    if is_another and not is_shipped and not replace:
+        raise ValueError(f"{folder} already has seed {seed}; --replace replaces it")
+    ships = (ship or is_shipped or not shipped) and not numbers
     with tempfile.TemporaryDirectory() as name:
         staged = Path(name)
         (staged / "seeds").mkdir()
@@ -87,6 +101,59 @@ def publish(run_dir, folder, ship: bool = False, numbers: bool = False):
             animate(staged)
             write_npz(staged / "eval.npz", task_of(metrics["env_id"]).kept_arrays(read_npz(staged / "eval.npz")))
         move(staged, folder, last, replaced=of_another_policy(folder) if ships else ())
+
+
+def refuse_strangers(run_dir: Path, folder: Path, seed: int):
+    """Raise ValueError if a run does not belong to the runs of other seeds in a results folder, or to today's problem.
+
+    The folder's policy says with which arguments all were trained.
+    """
+    evaluations = [*folder.glob("eval.json"), *(folder / "seeds").glob("*.json")]
+    others = [path for path in evaluations if read_json(path)["seed"] != seed]
+    for path in others:
+        refuse_difference(read_json(run_dir / "eval.json"), read_json(path), EVALUATED, run_dir, path)
+    policies = list(folder.glob("agent.safetensors")) if others else []
+    for path in policies:
+        mine, theirs = (compared_arguments(policy) for policy in (run_dir / "agent.safetensors", path))
+        refuse_difference(mine, theirs, mine.keys() & theirs.keys(), run_dir, path)
+    edited = first_edited([run_dir / "eval.json", run_dir / "agent.safetensors", *others, *policies])
+    if edited:
+        path, changed = edited
+        raise ValueError(
+            f"the problem of {path} has been edited since ({changed} differ); undo the edit, or train anew"
+        )
+
+
+EVALUATED = ("env_id", "eval_seed", "eval_starts", "total_updates")  # keys of eval.json that are the same in a folder
+
+
+def compared_arguments(policy: Path) -> dict:
+    """The arguments of a policy that the runs of a folder have in common. Of a path only whether it is given."""
+    args = read_record(policy)["args"]
+    return {
+        name: "a policy" if name == "checkpoint" and value else value
+        for name, value in args.items()
+        if name not in OWN_ARGUMENTS
+    }
+
+
+def refuse_difference(mine: dict, theirs: dict, names, run_dir: Path, path: Path):
+    """Raise ValueError for the first of the names under which two runs hold other values. An older one may lack it."""
+    for name in sorted(names):
+        if name not in mine or name not in theirs:
+            continue
+        if not are_one(mine[name], theirs[name], mine.get("total_updates")):
+            raise ValueError(f"{name} of {run_dir} is {mine[name]}; it must be {theirs[name]}, as in {path}")
+
+
+def are_one(value, other, updates: int | None) -> bool:
+    """Whether two arguments of trainings are the same. Schedules are, if they have the same value in each update."""
+    if value == other:
+        return True
+    have_points = all(isinstance(words, str) and ":" in words for words in (value, other))
+    if updates is None or not have_points:
+        return False
+    return np.array_equal(Schedule(value).over(updates), Schedule(other).over(updates))
 
 
 def shorten(run_dir) -> Path:
@@ -189,7 +256,7 @@ def seed_lines(folder) -> list[str]:
 
 
 def publish_command(args):
-    publish(args.run_dir, args.folder, args.ship)
+    publish(args.run_dir, args.folder, args.ship, replace=args.replace)
     print_tables(args.folder)
 
 
@@ -242,6 +309,13 @@ def page_command(args):
     print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")
 
 
+def say_if_edited(folder: Path):
+    """Print a line if a folder's flights are of another problem than today's table."""
+    edited = first_edited([folder / "eval.json"])
+    if edited:
+        print(f"{folder}: its problem has been edited since ({edited[1]} differ); its flights are of the old one")
+
+
 def print_tables(folder: Path):
     """Print the table of a results or run folder, and that of its seeds."""
     metrics = read_json(folder / "eval.json")
@@ -257,6 +331,7 @@ COMMANDS = {
     "export": export_command,
     "page": page_command,
 }
+SHOWING = ("figures", "animate", "opponents", "export", "page")  # commands that show the flights of a folder
 FORMATS = {
     "onnx": "one step of the policy, memory in and out",
     "csv": "the flights, a row each step",
@@ -281,6 +356,7 @@ def parse_args(argv=None):
     command.add_argument("run_dir", type=Path, help="a finished run: runs/...")
     command.add_argument("folder", type=Path, help="results/<name>, made if it does not exist")
     command.add_argument("--ship", action="store_true", help="replace the policy that the folder ships")
+    command.add_argument("--replace", action="store_true", help="replace the run of this seed that the folder has")
     command = commands.add_parser("shorten", help="write a run's policy in bfloat16 into RUN_DIR/bfloat16, and fly it")
     command.add_argument("run_dir", type=Path, help="a run: runs/...")
     redrawn = "redraw the figures of a results or run folder, print its table"
@@ -323,6 +399,8 @@ def main():
     """Run the sub-command. An error in it ends in one line."""
     args = parse_args()
     try:
+        if args.command in SHOWING and (args.folder / "eval.json").exists():
+            say_if_edited(args.folder)
         COMMANDS[args.command](args)
     except (ImportError, OSError, RuntimeError, ValueError) as error:
         sys.exit(f"evaluate.py: {error}")

@@ -37,9 +37,11 @@ import envs as _envs  # noqa: F401 - makes every id known to `task_of`
 from common import files
 from common.batch import make_batch
 from common.checkpoints import COUNTERS, read_checkpoint
+from common.command_line import typed_command
 from common.curves import read_curve
 from common.errors import BadInput, NoOptimum, refuse_unless
 from common.evaluations import write_evaluation
+from common.fingerprint import KEY, changes, fingerprint
 from common.flags import Policy, Range, Words, facts, plain_args
 from common.schedule import Schedule
 from common.tasks import Task, task_of
@@ -60,6 +62,7 @@ WORDS_OF_SCHEDULES = tyro.constructors.PrimitiveConstructorSpec(
 REGISTRY = tyro.constructors.ConstructorRegistry()
 REGISTRY.primitive_rule(lambda flag: WORDS_OF_SCHEDULES if flag.type is Schedule else None)
 ROOT = Path(__file__).resolve().parent
+fcntl: Any = importlib.import_module("fcntl") if importlib.util.find_spec("fcntl") else None  # Windows has none
 
 
 def fail(message) -> NoReturn:
@@ -153,6 +156,11 @@ def resumed(typed, script):
     if refused:
         refuse(refused[0], "", "only --cuda and --num-threads may be given beside --resume")
     saved = load_state(typed["resume"], script)
+    changed = changes_since(saved)
+    if changed:
+        env_id = saved["args"]["env_id"]
+        todo = "undo the edit, or begin a new training with --checkpoint"
+        fail(f"--resume {typed['resume']}: {env_id} has been edited since ({changed} differ); {todo}")
     return script.Args(**saved["args"]), saved
 
 
@@ -402,6 +410,9 @@ def load_checkpoint(agent, args, saved):
     """
     if args.checkpoint is None or args.resume is not None:
         return
+    changed = changes_since(saved) if saved["args"]["env_id"] == args.env_id else None
+    if changed:
+        print(f"--checkpoint {args.checkpoint}: {args.env_id} has been edited since its training ({changed} differ)")
     expected = {name: tuple(tensor.shape) for name, tensor in agent.state_dict().items()}
     shapes = {name: array.shape for name, array in saved["tensors"].items()}
     differing = [name for name in {**expected, **shapes} if expected.get(name) != shapes.get(name)]
@@ -422,6 +433,22 @@ def load_checkpoint(agent, args, saved):
     if not args.eval_only:
         digest = hashlib.sha256(Path(args.checkpoint).read_bytes()).hexdigest()
         print(f"begins with {args.checkpoint}, sha256 {digest}")
+
+
+def changes_since(saved):
+    """What has changed in the environment of a training state or checkpoint since its training, in words, or None.
+
+    An older file does not say what its environment did.
+    """
+    if saved.get(KEY) is None:
+        return None
+    return changes(saved[KEY], saved["args"]["env_id"])
+
+
+def options_of_policy(args, env_options):
+    """The environment's options that the file of a policy decides, and those that no flag sets."""
+    decided = facts(type(args), Policy)
+    return {name: value for name, value in env_options.items() if name in decided or name not in vars(args)}
 
 
 def observation_scale(env_id):
@@ -483,6 +510,7 @@ class Run:
         self.folder: Any = None  # a Path; only the first process sets it and the writer, in `with run:`
         self.writer: Any = None
         self.metrics = {}
+        self.fingerprint = None if self.rank > 0 else fingerprint(args.env_id, **options_of_policy(args, env_options))
         if self.rank > 0:  # all processes have the same weights, but draw other noise
             torch.manual_seed(args.seed + 2**31 * self.rank)
         self.counters = {"seed": args.seed, "total_updates": 0, "global_step": 0}
@@ -492,8 +520,8 @@ class Run:
             self.counters = restore(saved, self.folder, self.modules, envs)
         elif args.eval_only:
             self.counters = saved["counters"]
-        self.began = time.time() - self.counters["wall_seconds"]
-        self.update_began = time.time()
+        self.began = time.monotonic() - self.counters["wall_seconds"]
+        self.update_began = time.monotonic()
 
     @property
     def updates_done(self):
@@ -501,11 +529,12 @@ class Run:
         return self.counters["total_updates"]
 
     def __enter__(self):
-        self.state = training_state(self.args, self.modules, self.envs, self.counters)
+        self.state = self.current_state()
         if self.rank > 0:
             return self
         is_new = self.folder is None
         self.folder = self.folder or new_folder(f"{self.args.env_id}__{self.args.exp_name}__{self.args.seed}")
+        lock_folder(self.folder)
         try:
             if self.args.track:
                 track(self.args, self.folder.name)
@@ -524,7 +553,7 @@ class Run:
             files.write_json(self.folder / "args.json", arguments)
         self.writer = new_writer(self.folder, self.counters["global_step"] + 1, arguments)
         self.save()
-        self.update_began = time.time()
+        self.update_began = time.monotonic()
         return self
 
     def solve_reference(self):
@@ -536,7 +565,8 @@ class Run:
 
     def __exit__(self, kind, error, traceback):
         if self.writer:
-            self.writer.flush()
+            with files.naming(self.folder):
+                self.writer.flush()
         if error is None:
             return
         if not isinstance(error, KeyboardInterrupt | FloatingPointError):
@@ -549,10 +579,15 @@ class Run:
         if isinstance(error, FloatingPointError):
             kept = f"; the last good checkpoint is {self.folder}/training_state.pt" if saved else ""
             fail(f"update {updates + 1}: {error}, must be finite{kept}")
-        script = type(self.args)().exp_name
-        kept = f"go on with: python {script}.py --resume {self.folder}" if saved else "nothing saved"
+        script = f"{type(self.args)().exp_name}.py"
+        kept = f"go on with: {typed_command(script, '--resume', self.folder)}" if saved else "nothing saved"
         if self.rank == 0:
             print(f"stopped after update {updates}; {kept}")
+
+    def current_state(self):
+        """A copy of all that a resume needs. An environment that cannot be told by what it does has no fingerprint."""
+        state = training_state(self.args, self.modules, self.envs, self.counters)
+        return state if self.fingerprint is None else {**state, KEY: self.fingerprint}
 
     def save(self):
         """Write the state after the last whole update."""
@@ -565,13 +600,13 @@ class Run:
         alive (T, N) is the batch's, episodes the `final_info` of its flights. losses are means over the update.
         """
         args = self.args
-        now = time.time()
+        now = time.monotonic()
         steps = int(total(alive.sum()))
         episodes = gathered(episodes)
         self.counters = {**self.counters, "total_updates": iteration, "wall_seconds": now - self.began}
         self.counters["global_step"] += steps
         self.counters["training_seconds"] += now - self.update_began
-        state = training_state(args, self.modules, self.envs, self.counters)
+        state = self.current_state()
         if self.rank == 0:
             if args.eval_every and iteration % args.eval_every == 0:
                 self.metrics, _ = self.evaluate(TRAINING_EVAL_SEED)
@@ -586,21 +621,22 @@ class Run:
         self.state = state  # only now, so that a resume repeats an update whose evaluation was interrupted
         if iteration % SAVE_EVERY == 0 or iteration == args.total_updates:
             self.save()
-        self.update_began = time.time()
+        self.update_began = time.monotonic()
 
     def print_line(self, episodes):
         """Print how far the run is, what the sampled episodes earned and what the last evaluation found."""
         done = self.counters["total_updates"]
         of = self.args.total_updates
-        seconds = time.time() - self.began
+        seconds = time.monotonic() - self.began
         clock = f"{seconds / 60:.1f} min gone, {(of - done) * seconds / done / 60:.1f} to go"
         line = f"update {done}/{of}, {self.counters['global_step']} steps, {clock}"
         print(f"{line}: {self.describe(episodes, self.metrics)}", flush=True)
 
     def log(self, prefix, values):
         """Write every number of `values` under its TensorBoard tag."""
-        for name, value in values.items():
-            if isinstance(value, int | float):
+        numbers = {name: value for name, value in values.items() if isinstance(value, int | float)}
+        with files.naming(self.folder):  # TensorBoard writes in a thread, whose errors do not name the file
+            for name, value in numbers.items():
                 self.writer.add_scalar(f"{prefix}/{name}", value, self.counters["global_step"])
 
     def evaluate(self, eval_seed):
@@ -609,7 +645,8 @@ class Run:
         policy = average.make_policy(self.longest_episode)
         metrics, arrays = self.task.evaluate(policy, eval_seed, self.flights(eval_seed), **self.env_options)
         device = average.actor_logstd.device.type
-        return {**metrics, **self.counters, "device": device, "torch_version": torch.__version__}, arrays
+        metrics = {**metrics, **self.counters, "device": device, "torch_version": torch.__version__}
+        return metrics if self.fingerprint is None else {**metrics, KEY: self.fingerprint}, arrays
 
     @property
     def longest_episode(self):
@@ -637,7 +674,8 @@ class Run:
             print(self.task.table(metrics))
             return
         self.log("eval", metrics)
-        self.writer.close()
+        with files.naming(self.folder):
+            self.writer.close()
         if args.save_model:
             paths = (self.folder / name for name in ("agent.safetensors", "eval.json", "eval.npz"))
             write_evaluation(metrics, arrays, *paths)
@@ -651,6 +689,7 @@ class Run:
             draw_animation(self.folder, arrays, metrics)
         print(self.task.table(metrics))
         print(f"run folder: {self.folder}")
+        unlock_folder()
 
 
 def new_folder(name):
@@ -664,6 +703,34 @@ def new_folder(name):
             if not folder.is_dir():
                 raise
             time.sleep(0.1)
+
+
+locked = []  # the open run folder that this process has locked, if any
+
+
+def lock_folder(folder):
+    """Lock a run folder until `unlock_folder` or the end of this process, however it ends.
+
+    Ends with one line if another process has locked it, as two would write the same files. Where the system or the file
+    system has no such locks, nothing happens.
+    """
+    unlock_folder()
+    if fcntl is None:
+        return
+    locked.append(os.open(folder, os.O_RDONLY))
+    try:
+        fcntl.flock(locked[0], fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        unlock_folder()
+        fail(f"--resume {folder}: another process trains in this folder; stop it first, or wait for its end")
+    except OSError:  # as on some network drives
+        unlock_folder()
+
+
+def unlock_folder():
+    """Let other processes have the run folder that this one has locked, if any."""
+    while locked:
+        os.close(locked.pop())
 
 
 def new_writer(folder, first_step, arguments):
@@ -763,6 +830,8 @@ def save_run(run_dir, state):
     torch.save(state, buffer)
     files.write_bytes(run_dir / "training_state.pt", buffer.getbuffer())
     metadata = {"env_id": state["args"]["env_id"], "args": json.dumps(state["args"]), **state["progress"]}
+    if KEY in state:
+        metadata[KEY] = state[KEY]
     averaged = {name: x for name, x in state["average"].items() if name != "n_averaged"}
     weights = {name.removeprefix("module."): x.cpu() for name, x in averaged.items()}
     data = safetensors.torch.save(weights, {key: str(value) for key, value in metadata.items()})
@@ -791,14 +860,25 @@ def keep_memory():
 # ---------------------------------------------------------------------------------------------------------------------
 
 
+OF_TORCHRUN = ("WORLD_SIZE", "LOCAL_RANK", "MASTER_ADDR", "MASTER_PORT")  # it sets them beside RANK
+
+
 def join_processes(cuda):
     """Under torchrun, which sets RANK, become one of its processes. With GPUs each process takes its own."""
     if "RANK" not in os.environ or dist.is_initialized():
         return
+    missing = [name for name in OF_TORCHRUN if name not in os.environ]
+    if missing:
+        todo = "torchrun sets both; without it unset RANK"
+        fail(f"RANK is {os.environ['RANK']}, but {missing[0]} is not set; {todo}")
     use_gpu = torch.cuda.is_available() and cuda
-    if use_gpu:
-        torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
-    dist.init_process_group("nccl" if use_gpu else "gloo")
+    try:
+        if use_gpu:
+            torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
+        dist.init_process_group("nccl" if use_gpu else "gloo")
+    except (RuntimeError, ValueError) as error:  # a wrong number, or processes that do not meet
+        found = ", ".join(f"{name}={os.environ[name]}" for name in ("RANK", *OF_TORCHRUN))
+        fail(f"{found}: torchrun's processes cannot start ({error})")
 
 
 def rank_and_world_size():

@@ -94,7 +94,7 @@ class Training:
             files = [self.results / name for name in ("agent.safetensors", "eval.npz", "figures")]
             is_there &= all(file.exists() for file in files) and same(run / "eval.json", shipped)
         if not is_there:
-            evaluate.publish(run, self.results, ship=ship, numbers=numbers)
+            evaluate.publish(run, self.results, ship=ship, numbers=numbers, replace=True)
 
 
 def without_machine(args):

@@ -92,9 +92,10 @@ class BatchedEnv(VectorEnv):
     - `_snapshot()` returns new arrays: time (N,) in s, the last control (N, m) and state (N, n)
     - `_make_sheet()` returns the drawing, whose `frame(t, u, y)` is a flight's picture
 
-    Every problem has four attributes with a default: `dt`, the step in s (1); `phase` (N,), the 0-based phase in which
+    Every problem has five attributes with a default: `dt`, the step in s (1); `phase` (N,), the 0-based phase in which
     the running steps begin (0); `observation_scale`, a usual size of each observation (1), by which the networks of our
-    scripts divide the observation; and `generators`, its streams of random numbers, which a resume restores.
+    scripts divide the observation; `generators`, its streams of random numbers, which a resume restores; and `goals`,
+    numbers that few flights show (none).
 
     `reset(options={"training": {name: value}})` hands over what only a training changes. The names are the fields of
     `Training` or of the problem's own kind of it. The values stand in `self.training` and hold until the next `reset`.
@@ -168,6 +169,11 @@ class BatchedEnv(VectorEnv):
     def phase(self) -> np.ndarray:
         """The 0-based phase (N,) of the running steps."""
         return np.zeros(self.num_envs, dtype=np.int64)
+
+    @property
+    def goals(self) -> list[float]:
+        """Numbers of the table that a few flights need not show, such as the radius of a circle that they miss."""
+        return []
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
         """Start every environment anew. Returns (N, obs) float64 and an empty info."""

@@ -18,6 +18,7 @@ import safetensors
 
 from common.errors import BadInput
 from common.files import write_bytes
+from common.fingerprint import KEY
 
 KINDS = {"F64": np.float64, "F32": np.float32, "F16": np.float16, "BF16": np.uint16, "I64": np.int64}
 LARGE = 10_000  # a tensor of this many numbers or more is shortened
@@ -31,7 +32,8 @@ def read_checkpoint(
     defaults: Mapping = MappingProxyType({}),
     flag: str = "",
 ) -> dict:
-    """An agent.safetensors: `args` (the run's arguments), `counters`, `tensors` (NumPy arrays).
+    """An agent.safetensors: `args` (the run's arguments), `counters`, `tensors` (NumPy arrays), and the
+    fingerprint of its environment, or None.
 
     - expected: the type of each argument that must be there
     - env_ids: the environments that the file may be of; empty: any
@@ -67,13 +69,25 @@ def read_checkpoint(
         raise BadInput(f"{flag}{path}: its {name} is {args[name]!r}; must be {kinds}")
     if not all(np.isfinite(tensor).all() for tensor in tensors.values()):
         raise BadInput(f"{flag}{path}: holds a NaN or an infinity; its weights must be finite")
-    return {"args": args, "counters": counters, "tensors": tensors}
+    return {"args": args, "counters": counters, "tensors": tensors, KEY: metadata.get(KEY)}
 
 
 def read_metadata(data: bytes) -> dict[str, str]:
     """The metadata of a safetensors file. Raises KeyError without metadata."""
     header = data[8 : 8 + int.from_bytes(data[:8], "little")]
     return json.loads(header)["__metadata__"]
+
+
+def read_record(path) -> dict:
+    """What an agent.safetensors says of its training: `args`, and its environment's fingerprint or None.
+
+    {"args": {}, ...: None} if it says nothing. Raises OSError if it is not there.
+    """
+    try:
+        metadata = read_metadata(Path(path).read_bytes())
+        return {"args": json.loads(metadata["args"]), KEY: metadata.get(KEY)}
+    except (KeyError, TypeError, ValueError):
+        return {"args": {}, KEY: None}
 
 
 def read_tensors(data: bytes) -> dict[str, np.ndarray]:

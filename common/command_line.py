@@ -5,10 +5,39 @@ from __future__ import annotations
 import argparse
 import math
 import os
+import shlex
 import sys
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def typed_command(script: str, *words) -> str:
+    """A command line to copy: a Python file of this project and its words, started as this process was.
+
+    It works from the current directory. Under torchrun it begins with torchrun.
+    """
+    path = str(ROOT / script)
+    try:
+        path = min(os.path.relpath(path), path, key=len)
+    except ValueError:  # Windows has no relative path to another drive
+        pass
+    return shlex.join([*launcher(), path, *map(str, words)])
+
+
+def launcher() -> list[str]:
+    """The words that start a script in as many processes as torchrun started this one in; `python` without torchrun."""
+    environment = os.environ
+    if "LOCAL_WORLD_SIZE" not in environment:
+        return ["python"]
+    processes = f"--nproc-per-node={environment['LOCAL_WORLD_SIZE']}"
+    machines = environment.get("GROUP_WORLD_SIZE", "1")
+    if machines == "1":
+        return ["torchrun", processes]
+    first = [f"--master-addr={environment['MASTER_ADDR']}", f"--master-port={environment['MASTER_PORT']}"]
+    return ["torchrun", f"--nnodes={machines}", f"--node-rank={environment['GROUP_RANK']}", processes, *first]
 
 
 class OneLineParser(argparse.ArgumentParser):

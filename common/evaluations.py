@@ -4,9 +4,15 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shlex
 from pathlib import Path
 
+from common.checkpoints import read_record
+from common.command_line import typed_command
+from common.errors import BadInput
 from common.files import read_npz, write_json, write_npz
+from common.fingerprint import KEY, changes
+from common.policies import script_of
 from common.tasks import env_ids, task_of
 
 
@@ -49,7 +55,7 @@ def read_json(path: Path) -> dict:
     """The eval.json of a finished run. Raises ValueError that names the file and what is wrong with it."""
     if not path.exists():
         begun = (path.parent / "training_state.pt").exists()
-        why = f"; the training has not ended: go on with --resume {path.parent}" if begun else ""
+        why = f"; the training has not ended: go on with {resume_command(path.parent)}" if begun else ""
         raise ValueError(f"{path} is not there{why}")
     try:
         metrics = json.loads(path.read_text())
@@ -61,6 +67,41 @@ def read_json(path: Path) -> dict:
     if not isinstance(metrics.get("seed"), int):
         raise ValueError(f"{path}: seed is {metrics.get('seed')!r}; it must be an integer")
     return metrics
+
+
+def resume_command(run_dir: Path) -> str:
+    """The command line that goes on with a run. Only its flag if the run's files do not say of which script it is."""
+    try:
+        return typed_command(script_of(run_dir / "agent.safetensors").name, "--resume", run_dir)
+    except BadInput:
+        return shlex.join(["--resume", str(run_dir)])
+
+
+def fingerprint_in(path: Path) -> tuple[str | None, str]:
+    """The fingerprint in an eval.json or agent.safetensors, or None, and its environment's id.
+
+    Raises OSError or ValueError for a bad file.
+    """
+    if path.suffix == ".json":
+        metrics = read_json(path)
+        return metrics.get(KEY), metrics["env_id"]
+    record = read_record(path)
+    return record[KEY], record["args"].get("env_id", "")
+
+
+def first_edited(paths: list[Path]) -> tuple[Path, str] | None:
+    """The first of these files that is of another problem than today's, and what differs, in words. None without one.
+
+    A file without a fingerprint is older, and does not say. Raises OSError or ValueError for a bad file.
+    """
+    found = {}
+    for path in paths:
+        found.setdefault(fingerprint_in(path), path)
+    for (stored, env_id), path in found.items():
+        changed = None if stored is None else changes(stored, env_id)
+        if changed:
+            return path, changed
+    return None
 
 
 def refuse_another_policy(folder: Path, metrics: dict):

@@ -16,18 +16,26 @@ DAMAGED_NPZ = (ValueError, EOFError, BadZipFile, zlib.error, tokenize.TokenError
 
 
 @contextmanager
+def naming(path):
+    """Let an OSError in the block name `path` if it names no file, as that of a full disk."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno and not error.filename:
+            error.filename = str(path)
+        raise
+
+
+@contextmanager
 def replacing(path, mode: str = "wb"):
     """Open a temporary file that becomes `path` when the block ends without an error: whole or untouched."""
     path = Path(path)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        with open(temporary, mode, newline=None if "b" in mode else "") as file:
-            yield file
-        os.replace(temporary, path)
-    except OSError as error:
-        if error.errno and not error.filename:  # a full disk does not say which file
-            error.filename = str(path)
-        raise
+        with naming(path):
+            with open(temporary, mode, newline=None if "b" in mode else "") as file:
+                yield file
+            os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
 

@@ -144,6 +144,14 @@ class PhasedVectorEnv(BatchedEnv):
         """The 0-based phase (N,) of the running steps. After the last step it is the last phase."""
         return np.minimum(self._phase, len(self.problem.phases) - 1)
 
+    @property
+    def goals(self) -> list[float]:
+        """The radii and bonuses of all phases, and the bounds with their price."""
+        problem = self.problem
+        radii = [np.ravel(phase.radius) for phase in problem.phases]
+        bonuses = [phase.bonus for phase in problem.phases]
+        return [*np.concatenate(radii), *bonuses, *problem.limits.ravel(), problem.bound_price]
+
     def _tabulate(self):
         """Make the tables by phase, of which `_phase` picks a row."""
         problem = self.problem

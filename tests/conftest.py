@@ -20,7 +20,15 @@ import envs
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-LONGEST = ["test_processes", "test_scripts", "test_opponents", "test_rescue", "test_rocket_baselines", "test_docs", "test_onnx"]
+LONGEST = [
+    "test_processes",
+    "test_scripts",
+    "test_opponents",
+    "test_rescue",
+    "test_rocket_baselines",
+    "test_docs",
+    "test_onnx",
+]
 
 
 def pytest_collection_modifyitems(items):

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers import figure_of, headline_of, table_of
+from safetensors.numpy import save_file
 
 import baselines
 import envs
@@ -444,6 +445,47 @@ def test_numbers_alone_keep_the_curve_of_the_evaluations(tmp_path):
     evaluate.publish(make_run(tmp_path / "run"), tmp_path / "results", numbers=True)
     curve = read_csv(tmp_path / "results" / "seeds" / "1.csv")
     assert curve["charts/episodic_return"][0].tolist() == [40_000, 80_000, 120_000]
+
+
+def with_args(run, **args):
+    """The run, whose policy says that it was trained with these arguments."""
+    metadata = {"env_id": SINGLE, "args": json.dumps({"env_id": SINGLE, "total_updates": 10, **args})}
+    save_file({"weight": np.zeros(1, np.float32)}, run / "agent.safetensors", metadata)
+    metrics = json.loads((run / "eval.json").read_text())
+    digest = hashlib.sha256((run / "agent.safetensors").read_bytes()).hexdigest()
+    write_json(run / "eval.json", {**metrics, "checkpoint_sha256": digest})
+    return run
+
+
+def test_a_folder_has_runs_of_one_recipe_and_each_seed_once(tmp_path, monkeypatch):
+    for name in ("redraw", "animate"):
+        monkeypatch.setattr(evaluate, name, lambda folder: [])
+    results = tmp_path / "results"
+    first = {"recipe": "ours", "num_blocks": 2, "seed": 1, "num_threads": 1, "log_std": "0:-1 0.5:-1 0.5:-3 1:-3"}
+    evaluate.publish(with_args(make_run(tmp_path / "1", 1), **first), results)
+
+    own = {"seed": 2, "num_threads": 4, "exp_name": "my run", "log_std": "0:-1 0.5:-1 0.501:-3 1:-3", "track": True}
+    second = with_args(make_run(tmp_path / "2", 2), **{**first, **own})
+    evaluate.publish(second, results)
+    before = snapshot(results)
+    other = with_args(make_run(tmp_path / "3", 3), **first)
+    refused = {"recipe": "paper", "num_blocks": 3, "log_std": "0:-1 0.3:-1 0.3:-3 1:-3"}
+    for name, value in refused.items():
+        with pytest.raises(ValueError, match=f"^{name} of .*3 is {value}; it must be {first[name]}, as in .*results"):
+            evaluate.publish(with_args(other, **{**first, name: value}), results)
+    with_args(other, **first)
+    metrics = json.loads((other / "eval.json").read_text())
+    write_json(other / "eval.json", {**metrics, "eval_starts": 13})
+    with pytest.raises(ValueError, match="^eval_starts of .*3 is 13; it must be 12, as in .*results"):
+        evaluate.publish(other, results)
+
+    again = with_args(make_run(tmp_path / "again", 2), **first, level=1)
+    with pytest.raises(ValueError, match="already has seed 2; --replace replaces it"):
+        evaluate.publish(again, results)
+    assert snapshot(results) == before
+    evaluate.publish(again, results, replace=True)
+    assert (results / "seeds" / "2.json").read_bytes() == (again / "eval.json").read_bytes()
+    assert (results / "eval.json").read_bytes() == before[Path("eval.json")]
 
 
 def test_seeds_alone_say_of_which_problem_a_folder_is(tmp_path):

@@ -237,6 +237,15 @@ def test_torchrun_death_and_resume(tmp_path, whole):
         script.main([f"--resume={run}"])
 
 
+def test_a_rank_without_torchrun_is_one_line(monkeypatch):
+    """As some batch systems set it."""
+    for name in ("WORLD_SIZE", "LOCAL_RANK", "MASTER_ADDR", "MASTER_PORT"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("RANK", "0")
+    with pytest.raises(SystemExit, match="^error: RANK is 0, but WORLD_SIZE is not set"):
+        runs.join_processes(cuda=False)
+
+
 def test_processes_draw_other_noise(monkeypatch):
     """With the weights of one seed: the first process goes on with its own generator, the second takes another seed."""
     drawn = []

@@ -7,6 +7,7 @@ import importlib
 import json
 import re
 import resource
+import shlex
 import signal
 import subprocess
 import sys
@@ -52,7 +53,9 @@ def test_signals_end_with_a_saved_state(robustness, tmp_path, number, code):
     (run,) = (tmp_path / "runs").iterdir()
     done = torch.load(run / "training_state.pt", weights_only=True)["progress"]["total_updates"]
     last = output.splitlines()[-1]
-    assert last == f"stopped after update {done}; go on with: python ppo_gtrxl_di.py --resume runs/{run.name}"
+    words = shlex.split(last.removeprefix(f"stopped after update {done}; go on with: "))
+    assert words == ["python", words[1], "--resume", f"runs/{run.name}"]
+    assert (tmp_path / words[1]).resolve() == ROOT / "ppo_gtrxl_di.py"
 
 
 def test_full_disk_leaves_the_old_checkpoint(robustness, tmp_path):

@@ -156,4 +156,4 @@ def test_a_new_run_of_the_shipped_seed_replaces_what_is_shipped(tmp_path, monkey
     monkeypatch.setattr(run_seeds.Training, "run_dir", lambda job: run)
     monkeypatch.setattr(evaluate, "publish", lambda *args, **options: published.append((args, options)))
     run_seeds.Training(results, [], {"seed": seed}).publish(numbers=False)
-    assert published == [((run, results), {"ship": replaces, "numbers": False})]
+    assert published == [((run, results), {"ship": replaces, "numbers": False, "replace": True})]

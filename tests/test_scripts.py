@@ -2,15 +2,18 @@
 
 import contextlib
 import dataclasses
+import errno
 import hashlib
 import importlib
 import importlib.machinery
 import io
+import itertools
 import json
 import os
 import pickle
 import re
 import runpy
+import shlex
 import shutil
 import sys
 import time
@@ -30,7 +33,9 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 import baselines
 import envs
 import runs
+from common.command_line import typed_command
 from common.errors import BadInput, NoOptimum
+from common.fingerprint import KEY
 from common.flags import Range, facts, plain_args
 from common.schedule import Schedule
 from drawing import animation
@@ -357,7 +362,7 @@ def test_smoke_run_saves_the_averaged_weights(smoke):
     state = torch.load(run / "training_state.pt", weights_only=True)
     with safetensors.safe_open(run / "agent.safetensors", "pt") as file:
         metadata, weights = file.metadata(), {name: file.get_tensor(name) for name in file.keys()}
-    assert metadata.keys() == {"env_id", "args", "seed", "total_updates", "global_step", *CLOCKS}
+    assert metadata.keys() == {"env_id", "args", "seed", "total_updates", "global_step", KEY, *CLOCKS}
     assert json.loads(metadata["args"]) == json.loads((run / "args.json").read_text()) == state["args"]
     assert (metadata["env_id"], metadata["seed"], metadata["total_updates"]) == (env_id, "1", "2")
     assert metadata["global_step"] == str(steps_flown(run, env_id)[-1])
@@ -754,7 +759,7 @@ def test_an_interrupted_evaluation_is_made_again(fresh_folder, monkeypatch, caps
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(runs.Run, "evaluate", interrupted)
         DI.main([*TINY, "--total-updates=4", "--eval-every=1", "--exp-name=mine"])
-    assert f"python ppo_gtrxl_di.py --resume {run_folder()}" in capsys.readouterr().out
+    assert f"ppo_gtrxl_di.py --resume {run_folder()}" in capsys.readouterr().out
     assert state_of(run_folder())["progress"]["total_updates"] == 1
     DI.main([f"--resume={run_folder()}"])
     for tag in ("losses/policy_loss", "eval/ratio_of_sums"):
@@ -781,6 +786,72 @@ def test_seconds_of_training_and_of_all(fresh_folder, monkeypatch):
     for name in CLOCKS:
         assert first[name] < last[name] < time.time() - began - pause, name
     assert 0.6 < last["wall_seconds"] - last["training_seconds"]  # two updates after which it was evaluated
+
+
+def test_a_clock_that_is_set_back_changes_no_duration(fresh_folder, monkeypatch):
+    fresh_folder("clock")
+    clock = itertools.count(1_800_000_000, -3600)
+    monkeypatch.setattr(time, "time", lambda: next(clock))
+    DI.main([*TINY, "--total-updates=2"])
+    metrics = json.loads((run_folder() / "eval.json").read_text())
+    assert 0 < metrics["training_seconds"] <= metrics["wall_seconds"] < 600
+
+
+def test_a_run_folder_is_one_processs(tmp_path, capsys):
+    """The lock is of another open file, as another process has it, and goes with the file."""
+    fcntl = pytest.importorskip("fcntl")
+    other = os.open(tmp_path, os.O_RDONLY)
+    fcntl.flock(other, fcntl.LOCK_EX)
+    with pytest.raises(SystemExit, match=f"^error: --resume {tmp_path}: another process trains in this folder"):
+        runs.lock_folder(tmp_path)
+    os.close(other)  # as at the end of a process, also of a killed one
+    runs.lock_folder(tmp_path)
+    runs.lock_folder(tmp_path)  # the next run of the same process
+    other = os.open(tmp_path, os.O_RDONLY)
+    with pytest.raises(BlockingIOError):
+        fcntl.flock(other, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    runs.unlock_folder()
+    fcntl.flock(other, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    os.close(other)
+
+
+def test_a_run_that_trains_is_not_resumed(trained, tmp_path, monkeypatch):
+    run = Path(shutil.copytree(trained, tmp_path / "my run"))
+    runs.lock_folder(run)
+    before = files(run)
+    monkeypatch.setattr(runs, "locked", of_another := [])
+    with pytest.raises(SystemExit, match="^error: --resume .*my run: another process trains in this folder"):
+        DI.main([f"--resume={run}"])
+    assert files(run) == before and not of_another
+    monkeypatch.undo()
+    runs.unlock_folder()
+
+
+@pytest.mark.parametrize("here", ["", "results/di", "/"])
+def test_a_printed_command_works_where_it_is_printed(monkeypatch, here):
+    monkeypatch.chdir(ROOT / here)
+    line = typed_command("ppo_gtrxl_di.py", "--resume", Path("runs/my run"))
+    python, script, *flags = shlex.split(line)
+    assert python == "python" and (Path.cwd() / script).resolve() == SCRIPTS[0]
+    assert flags == ["--resume", "runs/my run"]
+    assert here or script == "ppo_gtrxl_di.py"
+    processes = {"RANK": 0, "LOCAL_RANK": 0, "WORLD_SIZE": 2, "LOCAL_WORLD_SIZE": 2, "GROUP_WORLD_SIZE": 1}
+    for name, value in processes.items():
+        monkeypatch.setenv(name, str(value))
+    line = typed_command("ppo_gtrxl_di.py", "--resume", "runs/x")
+    assert shlex.split(line) == ["torchrun", "--nproc-per-node=2", script, "--resume", "runs/x"]
+
+
+def test_a_full_disk_names_what_tensorboard_writes(tmp_path):
+    """Its thread's errors name no file."""
+
+    def no_space(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    writer = SimpleNamespace(add_scalar=no_space)
+    run = SimpleNamespace(folder=tmp_path, writer=writer, progress={"global_step": 1})
+    with pytest.raises(OSError, match=f"No space left on device: '{tmp_path}'"):
+        runs.Run.log(run, "eval", {"cost_mean": 1.0})
 
 
 def test_nan_keeps_and_names_the_last_good_checkpoint(fresh_folder, monkeypatch):
