@@ -187,7 +187,7 @@ def plan_one(job: PlanJob) -> tuple[Trajectory | None, float]:
         guesses = [job.guess]
     plan = None
     for guess in guesses:
-        mesh = LandingMesh.stretched(PLAN_INTERVALS, guess.seconds)
+        mesh = LandingMesh.stretched(job.lander, PLAN_INTERVALS, guess.seconds)
         try:
             plan = solve_from_guess(job.lander, job.descent, guess, mesh, limits=job.limits)
             break
