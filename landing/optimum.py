@@ -351,7 +351,9 @@ def stretched_optimum(lander: Lander, descent: Descent, glide_slope: float | Non
     failure = NoOptimum("landing: no time to solve it")
     for line in straight_lines(lander, descent, DURATIONS, INTERVALS):
         try:
-            path = solve_from_guess(lander, known, line, LandingMesh.stretched(lander, INTERVALS, line.seconds), glide_slope)
+            path = solve_from_guess(
+                lander, known, line, LandingMesh.stretched(lander, INTERVALS, line.seconds), glide_slope
+            )
             if is_healthy and descent.strike < path.seconds:
                 arcs = LandingMesh.stretched(lander, INTERVALS, path.seconds, descent.strike)
                 path = solve_from_guess(lander, descent, path, arcs, glide_slope)
