@@ -30,7 +30,7 @@ from importlib import import_module
 from pathlib import Path
 
 from common.errors import BadInput
-from common.registration import RegisteredIds
+from common.registration import REMARKS, RegisteredIds
 from common.tasks import add_family
 from landing.lander import LANDERS, MARS, POWERED_DESCENT, Lander, register_lander
 from phased.problem import PROBLEMS, Phase, Problem, register_problem, uniform
@@ -171,14 +171,19 @@ FILE_OF_ROCKET: dict[str, str] = {}  # the file that registered it, by environme
 
 
 def import_files_of(folder: str):
-    """Run every file of a folder of tables. A file that fails is left out, with a line that says why."""
+    """Run every file of a folder of tables. A file that fails is left out, with a line that says why.
+
+    The warnings of a file about its rockets are kept, and said when one of them is flown.
+    """
     for path in sorted(Path(__file__).parent.glob(f"{folder}/*.py")):
         known = set(ROCKETS)
         try:
-            with warnings.catch_warnings():
+            with warnings.catch_warnings(record=True) as caught:
                 warnings.filterwarnings("error", message=OF_ANOTHER)
                 import_module(f"{folder}.{path.stem}")
-            FILE_OF_ROCKET.update(dict.fromkeys(ROCKETS.keys() - known, f"{folder}/{path.name}"))
+            new = ROCKETS.keys() - known
+            FILE_OF_ROCKET.update(dict.fromkeys(new, f"{folder}/{path.name}"))
+            keep_remarks(f"{folder}/{path.name}", new, caught)
         except BadInput as error:
             print(f"{folder}/{path.name} is left out: {error}", file=sys.stderr)
         except UserWarning as error:
@@ -191,6 +196,16 @@ def import_files_of(folder: str):
         except (Exception, SystemExit) as error:  # a bad file must not stop the other files
             why = f"{type(error).__name__}: {error}"
             print(f"{folder}/{path.name} is left out: {why}", file=sys.stderr)
+
+
+def keep_remarks(file: str, rockets, caught: list):
+    """Keep the warnings of a file until one of its rockets is flown. Without a rocket they are said at once."""
+    lines = [f"{file}: {warning.message}" for warning in caught]
+    for env_id in rockets:
+        REMARKS[env_id] = lines
+    if not rockets:
+        for line in lines:
+            print(line, file=sys.stderr)
 
 
 register_rocket("RocketAscent-v0", **vars(PAPER_MISSION))

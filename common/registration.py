@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Container, Iterator, Mapping
 
 import gymnasium as gym
 from gymnasium.envs.registration import ENV_ID_RE, EnvSpec
 
 from common.errors import BadInput
+
+REMARKS: dict[str, list[str]] = {}  # by environment id: lines about the file that registered it, until they are said
+
+
+def say_remarks(env_id: str):
+    """Print the lines about the file of an id on stderr, once."""
+    for line in REMARKS.pop(env_id, []):
+        print(line, file=sys.stderr, flush=True)
 
 
 def register(env_id: str, maker: str, replaceable: Container[str] = ()):
@@ -24,6 +33,7 @@ def register(env_id: str, maker: str, replaceable: Container[str] = ()):
     if not is_new or not ENV_ID_RE.fullmatch(env_id) or "/" in env_id:
         raise BadInput(allowed)
     gym.registry.pop(env_id, None)
+    REMARKS.pop(env_id, None)
     try:
         gym.register(
             id=env_id,

@@ -20,9 +20,10 @@ GREEN, WHITE = [57, 211, 83, 255], [255, 255, 255, 255]
 def czml_bytes(track: Track, epoch: datetime, launch_longitude: float) -> bytes:
     """The file. epoch is the moment of lift-off (UTC), launch_longitude is in degrees east."""
     ground = over_ground(track, launch_longitude)
-    end = float(track.t[-1])
-    interval = f"{stamp(epoch, 0.0)}/{stamp(epoch, end)}"
-    samples = np.column_stack([track.t, ground["longitude_deg"], ground["latitude_deg"], ground["altitude_m"]])
+    # rounded as in `stamp`: Cesium shows nothing between the last sample and an interval's end that is rounded up
+    t = np.array([timedelta(seconds=seconds).total_seconds() for seconds in track.t.tolist()])
+    interval = f"{stamp(epoch, 0.0)}/{stamp(epoch, t[-1])}"
+    samples = np.column_stack([t, ground["longitude_deg"], ground["latitude_deg"], ground["altitude_m"]])
     document = {
         "id": "document",
         "name": track.name,
@@ -38,6 +39,7 @@ def czml_bytes(track: Track, epoch: datetime, launch_longitude: float) -> bytes:
         "epoch": stamp(epoch, 0.0),
         "interpolationAlgorithm": "LAGRANGE",
         "interpolationDegree": 2,
+        "forwardExtrapolationType": "HOLD",
         "cartographicDegrees": samples.ravel().tolist(),
     }
     vehicle = {

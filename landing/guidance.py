@@ -260,7 +260,7 @@ class Replanned:
             t = np.linspace(passed, plan.seconds, PLAN_INTERVALS + 1)
             guesses = [Trajectory(t - passed, plan.thrust_at((t[:-1] + t[1:]) / 2), plan.state_at(t))]
         for guess in guesses:
-            mesh = LandingMesh.stretched(PLAN_INTERVALS, guess.seconds)
+            mesh = LandingMesh.stretched(self.lander, PLAN_INTERVALS, guess.seconds)
             with suppress(NoOptimum):
                 found = solve_from_guess(self.lander, descent, guess, mesh, limits=limits)
                 return found, time.process_time() - begin

@@ -21,6 +21,9 @@ from common.registration import register
 FAILURE_TIMES = ("start", "random")
 LAST_FAILURE = 40.0  # s, before which "random" failures strike
 VERTICAL_LOSS = 1.5  # a failure of any size divides the thrust along z by this
+ROCK = 3340.0  # kg/m^3, the density of the Moon; Mars and the Earth are denser, and so smaller for their gravity
+G = 6.674e-11  # m^3/(kg s^2)
+MOST_NEGLECTED = 0.5  # share of gravity that flat ground may neglect
 
 
 @dataclass(frozen=True)
@@ -42,6 +45,7 @@ class Lander:
     failure_probability: float = 0.0  # probability of a hidden failure, unless the environment is given another
     failure_size: float = 2.5  # a failure divides the thrust along one lateral axis by this
     longest: float = 100.0  # s, the longest flight
+    radius: float | None = None  # m, of the planet, which tells how far flat ground holds (None: `ROCK`'s)
 
     def __post_init__(self):
         refuse_unless_finite("a lander's", self)
@@ -67,6 +71,9 @@ class Lander:
         refuse_unless(min(self.spread) >= 0, "a lander's spread", self.spread, "must not be negative")
         low = self.start[2] - self.spread[2]
         refuse_unless(low > 0, "a lander's start", self.start, "must be above the ground (z > 0), with its spread")
+        possible = self.radius is None or (is_finite(self.radius) and self.radius > 0)
+        refuse_unless(possible, "a lander's radius", self.radius, "must be positive and finite, or None")
+        check_flatness(self)
 
     @property
     def exhaust(self) -> float:
@@ -84,6 +91,11 @@ class Lander:
         return r0 + v * self.longest, v
 
     @property
+    def height(self) -> float:
+        """|r| + v^2 / (2 g) in m of the farthest and fastest start: its energy as a height above the pad."""
+        return self.farthest(slice(0, 3)) + self.farthest(slice(3, 6)) ** 2 / (2 * self.gravity)
+
+    @property
     def has_one_flight(self) -> bool:
         """Whether all flights are equal, as long as nothing fails."""
         return not any((*self.spread, self.mass_spread, self.gravity_spread, self.failure_probability))
@@ -91,6 +103,21 @@ class Lander:
     def farthest(self, of: slice) -> float:
         """The greatest norm of some components of a start."""
         return float(np.linalg.norm(np.abs(self.start[of]) + np.array(self.spread[of])))
+
+
+def check_flatness(lander: Lander):
+    """Raise BadInput for a start that is too far from the pad or too fast for flat ground.
+
+    Over a round planet gravity at the start points elsewhere by distance / radius, and a horizontal speed v carries
+    v^2 / (g radius) of the weight. Flat ground neglects both.
+    """
+    radius = lander.radius or 3 * lander.gravity / (4 * math.pi * G * ROCK)
+    turned = lander.farthest(slice(0, 2)) / radius
+    carried = lander.farthest(slice(3, 5)) ** 2 / (lander.gravity * radius)
+    planet = f"the ground is flat here, and on a planet with a radius of {radius / 1e3:.4g} km"
+    shares = f"distance / radius and v^2 / (gravity radius) are {turned:.2f} + {carried:.2f}"
+    allowed = f"must be nearer or slower: {planet} {shares}, above {MOST_NEGLECTED:g}"
+    refuse_unless(turned + carried <= MOST_NEGLECTED, "a lander's start", lander.start, allowed)
 
 
 def check_failure(probability: float, size: float, time: str = "start"):

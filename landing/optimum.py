@@ -76,7 +76,8 @@ class Trajectory(NamedTuple):
 # ---------------------------------------------------------------------------------------------------------------------
 
 UNITS = np.array([1000.0] * 3 + [50.0] * 3 + [1000.0])  # m, m/s, kg; in these units a state is of order 1
-BOX = 20.0  # units of r and v; no descent comes near it, but it keeps IPOPT's first steps near the pad
+HEIGHT, GRAVITY = 4000.0, 3.7114  # m, m/s^2: these units are for a `Lander.height` from `HEIGHT` to twice that
+BOX = 20.0  # units of r and v, at least 2.5 `Lander.height`; it keeps IPOPT's first steps near the pad
 TOUCHDOWN = np.array([0.0, 0.0, -1e-7, 0.0, 0.0, -0.01])  # m and m/s; at rest it might miss the ground by rounding
 CLEARANCE = 0.1  # m at the ends of periods, because the path sags between them by up to 0.05 m
 LAST_APPROACH = 1.0  # s before touchdown, in which the path may come nearer to the ground
@@ -92,13 +93,17 @@ class LandingMesh(NamedTuple):
     longest: float  # s, upper bound of the unknown length
 
     @classmethod
-    def stretched(cls, count: int, seconds: float, strike: float = 0.0) -> LandingMesh:
-        """Intervals of about like length for a landing that takes `seconds`. Those before the strike (s) are fixed."""
+    def stretched(cls, lander: Lander, count: int, seconds: float, strike: float = 0.0) -> LandingMesh:
+        """Intervals of about like length for a landing that takes `seconds`. Those before the strike (s) are fixed.
+
+        All together they may last as long as the lander's longest flight.
+        """
         before = 0
         if strike > 0:
             before = min(max(round(count * strike / seconds), 1), count - 1)
         is_free = np.arange(count) >= before
-        return cls(np.where(is_free, 0.0, strike / max(before, 1)), is_free, LONGEST)
+        longest = max(LONGEST, lander.longest / count)
+        return cls(np.where(is_free, 0.0, strike / max(before, 1)), is_free, longest)
 
     @classmethod
     def periods(cls, count: int) -> LandingMesh:
@@ -115,8 +120,19 @@ class LandingMesh(NamedTuple):
         return float(np.clip((seconds - self.fixed.sum()) / self.is_free.sum(), SHORTEST, self.longest))
 
 
+def units_of(lander: Lander) -> np.ndarray:
+    """The units (7,) of r (m), v (m/s) and m (kg) in a lander's program.
+
+    r grows with the lander's height, in powers of two, so that landers of about one size share their units. v grows as
+    in a fall, with the square root of r times gravity.
+    """
+    length = 2.0 ** np.floor(np.log2(lander.height / HEIGHT))
+    speed = np.sqrt(length * lander.gravity / GRAVITY)
+    return UNITS * np.array([length] * 3 + [speed] * 3 + [1.0])
+
+
 def interval_of(lander: Lander):
-    """An interval as a CasADi function, in `UNITS` and units of the greatest thrust.
+    """An interval as a CasADi function, in `units_of` the lander and units of the greatest thrust.
 
     (y, thrust, seconds, gravity, effectiveness) -> (y at its end, |thrust|^2, |command|^2)
     """
@@ -127,11 +143,12 @@ def interval_of(lander: Lander):
     seconds = ca.SX.sym("seconds")
     gravity = ca.SX.sym("gravity", 3)
     effectiveness = ca.SX.sym("effectiveness", 3)
-    state = y * ca.DM(UNITS)
+    units = ca.DM(units_of(lander))
+    state = y * units
     norm = ca.sqrt(ca.sumsqr(thrust) + 1e-16)  # the root has no derivative at 0
     flow = lander.greatest_thrust * norm / lander.exhaust
     motion = state[:3], state[3:6], state[6], thrust / norm, flow, gravity, seconds
-    after = ca.vertcat(*burn(*motion, lander.exhaust, log1p=ca.log1p)) / ca.DM(UNITS)
+    after = ca.vertcat(*burn(*motion, lander.exhaust, log1p=ca.log1p)) / units
     norms = ca.sumsqr(thrust), ca.sumsqr(thrust / effectiveness)
     return ca.Function("interval", [y, thrust, seconds, gravity, effectiveness], [after, *norms])
 
@@ -185,15 +202,16 @@ def landing_solver(lander: Lander, count: int, has_cone: bool):
 def bounds_of(lander: Lander, mesh: LandingMesh, glide_slope: float | None, limits: tuple[float, float]) -> dict:
     """The bounds of a program's unknowns and constraints, for CasADi's `nlpsol`. `limits` of the thrust are in N."""
     count = len(mesh.fixed)
+    units = units_of(lander)
     low = np.full((count, 7), -BOX)
     high = np.full((count, 7), BOX)
-    low[:, 6] = lander.dry_mass / UNITS[6]
+    low[:, 6] = lander.dry_mass / units[6]
     high[:, 6] = np.inf
     if glide_slope is not None:
         times = mesh.times(SHORTEST)
         left = times[-1] - times[1:]  # s that are left at least
-        low[:, 2] = np.where(left > LAST_APPROACH, CLEARANCE / UNITS[2], 0.0)
-    low[-1, :6] = high[-1, :6] = TOUCHDOWN / UNITS[:6]
+        low[:, 2] = np.where(left > LAST_APPROACH, CLEARANCE / units[2], 0.0)
+    low[-1, :6] = high[-1, :6] = TOUCHDOWN / units[:6]
     ones = np.ones(3 * count)
     least, greatest = (np.array(limits) / lander.greatest_thrust) ** 2
     lbg = np.concatenate([np.zeros(7 * count), np.full(count, least), np.full(count, -np.inf)])
@@ -263,6 +281,16 @@ def straight_lines(lander: Lander, descent: Descent, shares: tuple[float, ...], 
     return [straight_line(lander, descent, share * seconds, count) for share in shares]
 
 
+def suspects(lander: Lander) -> str:
+    """The fields that are usually wrong if no landing is found, in words."""
+    causes = "greatest_thrust too small, start too low or too fast, too little propellant (mass, dry_mass)"
+    full, dry = (mass * lander.gravity for mass in (lander.mass, lander.dry_mass))
+    if lander.least_thrust <= dry:
+        return f"{causes}, or longest too short"
+    weight = f"the weight is {full:.0f} N at first and {dry:.0f} N at dry_mass, and the engine is never off"
+    return f"{causes}, longest too short, or least_thrust, {lander.least_thrust:g} N, too great: {weight}"
+
+
 @interruptible()
 def solve_from_guess(
     lander: Lander,
@@ -278,24 +306,24 @@ def solve_from_guess(
     allows any path. The failure strikes at the beginning of an interval. Raises NoOptimum if IPOPT finds none.
     """
     count = len(mesh.fixed)
+    units = units_of(lander)
     length = mesh.length(guess.seconds)
     t = mesh.times(length)
     thrust = guess.thrust_at((t[:-1] + t[1:]) / 2)
     y = guess.state_at(t[1:])
-    unknowns = [(thrust / lander.greatest_thrust).ravel(), (y / UNITS).ravel(), [length]]
+    unknowns = [(thrust / lander.greatest_thrust).ravel(), (y / units).ravel(), [length]]
     effectiveness = descent.effectiveness(t[:-1])
     tangent = np.tan(np.radians(glide_slope or 0.0))
-    parameters = [descent.state / UNITS, descent.gravity, effectiveness.ravel(), mesh.fixed, mesh.is_free, [tangent]]
+    parameters = [descent.state / units, descent.gravity, effectiveness.ravel(), mesh.fixed, mesh.is_free, [tangent]]
     solve = landing_solver(lander, count, bool(glide_slope))
     bounds = bounds_of(lander, mesh, glide_slope, limits or (lander.least_thrust, lander.greatest_thrust))
     solution = solve(x0=np.concatenate(unknowns), p=np.concatenate(parameters), **bounds)
     status = solve.stats()["return_status"]
     if status != "Solve_Succeeded":
-        causes = "greatest_thrust too small, start too low or too fast, or too little propellant (mass, dry_mass)"
-        raise NoOptimum(f"landing: IPOPT stopped with {status}; it may be {causes}")
+        raise NoOptimum(f"landing: IPOPT stopped with {status}; it may be {suspects(lander)}")
     found = solution["x"].full()[:, 0]
     thrust = found[: 3 * count].reshape(count, 3) * lander.greatest_thrust
-    y = np.vstack([descent.state, found[3 * count : -1].reshape(count, 7) * UNITS])
+    y = np.vstack([descent.state, found[3 * count : -1].reshape(count, 7) * units])
     return Trajectory(mesh.times(found[-1]), thrust, y)
 
 
@@ -308,7 +336,8 @@ DURATIONS = (0.8, 1.2, 0.6)  # guessed durations, in units of the energy-optimal
 PERIODS_TRIES = 6  # numbers of periods that are tried, until the last period is within its bounds
 POSITION_TOLERANCE = 0.01  # m
 SPEED_TOLERANCE = 0.02  # m/s
-FUEL_TOLERANCE = 0.05  # kg, which full thrust burns in 4 ms
+FUEL_TOLERANCE = 0.05  # kg
+TOUCHDOWN_TOLERANCE = 0.004  # s; what full thrust burns in it is tolerated, too
 
 
 def stretched_optimum(lander: Lander, descent: Descent, glide_slope: float | None, clock: SolveClock) -> Trajectory:
@@ -322,9 +351,11 @@ def stretched_optimum(lander: Lander, descent: Descent, glide_slope: float | Non
     failure = NoOptimum("landing: no time to solve it")
     for line in straight_lines(lander, descent, DURATIONS, INTERVALS):
         try:
-            path = solve_from_guess(lander, known, line, LandingMesh.stretched(INTERVALS, line.seconds), glide_slope)
+            path = solve_from_guess(
+                lander, known, line, LandingMesh.stretched(lander, INTERVALS, line.seconds), glide_slope
+            )
             if is_healthy and descent.strike < path.seconds:
-                arcs = LandingMesh.stretched(INTERVALS, path.seconds, descent.strike)
+                arcs = LandingMesh.stretched(lander, INTERVALS, path.seconds, descent.strike)
                 path = solve_from_guess(lander, descent, path, arcs, glide_slope)
             return path
         except NoOptimum as error:
@@ -379,7 +410,8 @@ def optimise_landing(lander: Lander, flight: Flights, glide_slope: float | None 
     position_error = np.linalg.norm(y[-1, :3])
     speed = np.linalg.norm(y[-1, 3:6])
     is_soft = position_error < POSITION_TOLERANCE and speed < SPEED_TOLERANCE
-    differs = len(y) != len(path.y) or not abs(path.y[-1, 6] - y[-1, 6]) < FUEL_TOLERANCE
+    tolerance = max(FUEL_TOLERANCE, TOUCHDOWN_TOLERANCE * lander.greatest_thrust / lander.exhaust)
+    differs = len(y) != len(path.y) or not abs(path.y[-1, 6] - y[-1, 6]) < tolerance
     fuel = float(y[0, 6] - y[-1, 6])
     if differs or not is_soft:
         solved = f"a solution of {path.seconds:.2f} s and {path.fuel:.3f} kg"

@@ -28,6 +28,7 @@ from common.batch import (
 )
 from common.errors import BadInput, is_finite, refuse_unless
 from common.flying import fly_until_ended
+from common.registration import say_remarks
 from rocket.dispersion import (
     DISPERSION,
     LARGEST_DISPERSION,
@@ -528,6 +529,7 @@ def flown_mission(mission: Mission, rocket: Rocket | None = None, table_isp: boo
 def make_rocket_vector(env_id: str, num_envs: int = 1, rocket: Rocket | None = None, **options) -> RocketVectorEnv:
     """The batched environment of a mission in `ROCKETS`, or of another rocket on it. `gymnasium.make_vec` calls it."""
     check_options(RocketVectorEnv, options, "rocket")
+    say_remarks(env_id)
     return RocketVectorEnv(num_envs, flown_mission(ROCKETS[env_id], rocket), **options)
 
 

@@ -33,6 +33,7 @@ from rocket.missions import ROCKETS, Mission
 from rocket.optimum import (
     GAUSS_POINTS,
     MAX_ITERATIONS,
+    box_of,
     collocation,
     interpolate,
     kept_reference,
@@ -304,7 +305,7 @@ def optimise_remaining(rocket: Rocket, remaining: RemainingAscent, guess: dict, 
     states = interpolate(np.append(t[1:], t_u), guess["t"], guess["y"]) / scale
     directions = interpolate(t_u, guess["t_u"], guess["u"])
     w = np.concatenate([states.ravel(), directions.ravel(), [t[-1] - ignition]])
-    box = np.full(len(w) - 1, 2.0)  # as in solve_from_guess
+    box = box_of(rocket, n * (1 + points), len(t_u))
     equal = np.zeros(n * (7 * points + 6) + 5)
     radius = np.full(n, 1 + 1 / rocket.Re)
     bounds = {"lbx": np.append(-box, 0.0), "ubx": np.append(box, remaining.end[-1] - ignition)}

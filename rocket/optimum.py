@@ -20,6 +20,7 @@ from common.errors import BadInput, NoOptimum
 from common.files import DAMAGED_NPZ
 from common.integration import rk4
 from common.ipopt import LEAST, SolveClock, interruptible
+from common.registration import say_remarks
 from rocket.dynamics import ascent_dynamics
 from rocket.environment import flown_mission, fly_rocket
 from rocket.missions import PAPER_MISSION, ROCKETS, Mission
@@ -71,6 +72,23 @@ class AscentMesh(NamedTuple):
 def state_scale(rocket: Rocket):
     """The units (6,) of r and v: the Earth's radius (m) and the circular speed there (m/s)."""
     return np.repeat([rocket.Re, np.sqrt(rocket.mu / rocket.Re)], 3)
+
+
+BOX = 2.0  # units of every state and direction, which keeps IPOPT's first steps near the Earth
+RISE = 0.8  # of the circular speed at the ground; no ascent moves away faster than that on average
+
+
+def box_of(rocket: Rocket, states: int, directions: int) -> np.ndarray:
+    """The bounds of a program's states (6 each) and directions (3 each): `BOX`, and more for r on a far orbit.
+
+    r may be as far as a little above the target's apogee, if the flight is long enough to come there.
+    """
+    units = state_scale(rocket)
+    apogee = 1.2 * rocket.a * (1 + rocket.e) / units[0]
+    risen = 1 + RISE * rocket.end_time * units[3] / units[0]
+    far = max(BOX, min(apogee, risen))
+    state = np.array([far] * 3 + [BOX] * 3)
+    return np.append(np.tile(state, states), np.full(3 * directions, BOX))
 
 
 def collocation_mesh(case: AscentCase, end: float, segments: int) -> AscentMesh:
@@ -229,7 +247,7 @@ def solve_from_guess(case: AscentCase, mesh: AscentMesh, guess: dict, clock: Sol
     times = np.append(mesh.t[1:], mesh.t_u if points else [])  # of x and z
     states = interpolate(times, guess["t"], guess["y"][:, :6]) / scale
     start = np.concatenate([states.ravel(), interpolate(mesh.t_u, guess["t_u"], guess["u"]).ravel(), mesh.t[-1:]])
-    box = np.full(len(start) - 1, 2.0)  # no ascent comes near it, but it keeps IPOPT's first steps near the Earth
+    box = box_of(rocket, len(times), len(mesh.t_u))
     equal = np.zeros(program["g"].numel() - n)
     low, high = (np.append(equal, np.full(n, 1 + h / rocket.Re)) for h in (case.floor, case.ceiling))
     lbx = np.append(-box, mesh.final_time[0])
@@ -505,6 +523,7 @@ def rocket_reference(env_id: str, **options) -> dict:
 
 def mission_reference(env_id: str, mission: Mission) -> dict:
     """`rocket_reference` of a mission. The id may be registered for another mission."""
+    say_remarks(env_id)
     case = reference_case(env_id, mission)
     found = stored_reference(env_id, case) if mission == ROCKETS[env_id] else None
     if found is None:

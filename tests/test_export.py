@@ -305,7 +305,9 @@ def test_czml_shows_the_flight(tmp_path):
     begin, end = map(datetime.fromisoformat, document["clock"]["interval"].split("/"))
     assert begin == epoch and (end - begin).total_seconds() == pytest.approx(arrays["t"][-1], abs=1e-6)
     t, longitude, latitude, height = np.reshape(vehicle["position"]["cartographicDegrees"], (-1, 4)).T
-    assert np.array_equal(t, arrays["t"])
+    np.testing.assert_allclose(t, arrays["t"], atol=1e-6)
+    assert t[-1] == (end - begin).total_seconds()  # after the last sample Cesium shows nothing
+    assert vehicle["position"]["forwardExtrapolationType"] == "HOLD"
     assert (longitude[0], latitude[0], height[0]) == pytest.approx((SITE, 28.5, 0.0), abs=1e-6)
     np.testing.assert_allclose(height, np.linalg.norm(arrays["y"][:, :3], axis=1) - 6378145.0, atol=1e-6)
     ends = [datetime.fromisoformat(label["interval"].split("/")[1]) for label in vehicle["label"]["text"]]

@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 from common.errors import BadInput, NoOptimum
 from envs import MARS, POWERED_DESCENT, fly_lander
 from landing import optimum
-from landing.lander import DRAW, draw_flights
+from landing.lander import DRAW, Lander, draw_flights
 from landing.optimum import optimise_landing, references
 
 pytestmark = pytest.mark.slow
@@ -157,6 +157,34 @@ def test_an_optimum_that_is_not_there_is_one_line():
     brief = replace(MARS, longest=10.0)
     with pytest.raises(NoOptimum, match="^landing: it takes [^\n]* longer than a flight, 10 s$"):
         optimise_landing(brief, draw_flights(brief, rows(1), 0.0, 2.5, "start"))
+
+
+APOLLO = Lander(
+    mass=15200.0, dry_mass=6800.0, isp=311.0, least_thrust=4500.0, greatest_thrust=45000.0, g0=9.80665,
+    gravity=1.6249, longest=400.0, start=(-20500.0, 0.0, 6000.0, 250.0, 0.0, -50.0),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("x, speed, fuel", [(-20500.0, 250.0, 1743.9), (-30000.0, 300.0, 2032.8)])
+def test_a_start_may_be_far_away(x, speed, fuel):
+    """Solved elsewhere with bounds of 100 km and 5 km/s."""
+    far = replace(APOLLO, start=(x, 0.0, 6000.0, speed, 0.0, -50.0))
+    found = optimise_landing(far, draw_flights(far, np.full((1, len(DRAW)), 0.5), 0.0, 1.0, "start"), 0)
+    assert found["fuel_kg"] == pytest.approx(fuel, abs=0.05)
+
+
+def test_a_start_in_orbit_is_refused_on_flat_ground():
+    orbit = (-420e3, 0.0, 15e3, 1700.0, 0.0, 0.0)
+    with pytest.raises(BadInput, match="^a lander's start is [^\n]* the ground is flat here"):
+        replace(APOLLO, start=orbit)
+    replace(APOLLO, start=orbit, radius=1e9)  # the Sun's size: it is flat there
+
+
+def test_a_least_thrust_above_the_weight_is_named(monkeypatch):
+    monkeypatch.setattr(optimum, "DURATIONS", (0.8,))
+    strong = replace(MARS, least_thrust=23000.0, start=(0.0, 0.0, 2000.0, 0.0, 0.0, 0.0), dry_mass=1800.0)
+    with pytest.raises(NoOptimum, match="least_thrust, 23000 N, too great: the weight is 7423 N at first"):
+        optimise_landing(strong, draw_flights(strong, rows(1), 0.0, 2.5, "start"), 0)
 
 
 def test_a_solution_that_does_not_land_is_refused(monkeypatch):

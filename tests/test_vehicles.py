@@ -305,6 +305,22 @@ def test_a_bad_file_of_vehicles_is_left_out_with_a_line(tmp_path):
     assert copy == f"vehicles/zz_copy.py is left out: {allowed}"
 
 
+def test_a_warning_of_a_file_is_said_with_its_own_rocket_alone(tmp_path):
+    shutil.copy(ROOT / "envs.py", tmp_path)
+    for room in ("common", "landing", "phased", "rocket"):
+        shutil.copytree(ROOT / room, tmp_path / room)
+    (tmp_path / "vehicles").mkdir()
+    doubtful = (ROOT / "vehicles" / "two_stage_leo.py").read_text().replace("isp=348.0", "isp=300.0")
+    (tmp_path / "vehicles" / "doubtful.py").write_text(doubtful)
+    said = []
+    for env_id in (FIXED, LEO):
+        code = f"import envs, gymnasium; gymnasium.make('{env_id}'); gymnasium.make('{env_id}')"
+        done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=60)
+        said.append(done.stderr.splitlines())
+    assert said[0] == []
+    assert len(said[1]) == 1 and said[1][0].startswith("vehicles/doubtful.py: an engine's isp is 300 s")
+
+
 # --- one burn, three burns, another site and target -------------------------------------------------------------------
 
 
