@@ -205,7 +205,10 @@ def describe(episodes, metrics):
     words = f"return {episodes['episodic_return'].mean():8.2f}"
     if "cost" in episodes:
         words += f"  cost {episodes['cost'].mean():7.3f}"
-    if "hit" in episodes:
+    if "arrived" in episodes:
+        words += f"  arrive {episodes['arrived'].mean():4.0%}"
+    has_target = "terminal_error" in episodes and episodes["terminal_error"].any()
+    if "hit" in episodes and (has_target or "arrived" not in episodes):  # without a target nothing can be missed
         words += "  hits " + " ".join(f"{share:4.0%}" for share in episodes["hit"].mean(axis=0))
     if "ratio_of_sums" in metrics:
         words += f"  ratio {metrics['ratio_of_sums']:.4f}"

@@ -128,7 +128,7 @@ class LanderTask(SampledTask):
     def baseline_command(self, args) -> tuple[dict, dict]:
         if self.lander.has_one_flight:
             allowed = f"must be left out: {self.env_id} has one start"
-            refuse_unless(args.starts == SOLVED, "--starts", args.starts, allowed)
+            refuse_unless(args.starts in (1, SOLVED), "--starts", args.starts, allowed)
             refuse_unless(args.seed == 0, "--seed", args.seed, allowed)
         return report_lander(self.env_id, args.starts, args.seed)
 

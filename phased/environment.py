@@ -12,7 +12,7 @@ from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
 
 from common.batch import RENDERED, BatchedEnv, SingleEnv, Training, check_options, numeric, refuse_autoreset
-from common.errors import refuse_unless
+from common.errors import BadInput, refuse_unless
 from common.flying import fly_until_ended
 from common.integration import falling_root
 from phased.problem import LARGEST_SCORE, PROBLEMS, Phase, Problem
@@ -55,7 +55,7 @@ class PhasedVectorEnv(BatchedEnv):
     - `episodic_return` (N,), with the true radii
     - `cost` (N,) and its parts `cost_state`, `cost_control`, `cost_terminal` (N,), or those of `Problem.parts`
     - `hit` and `terminal_error` (N, phases): the distance to the target at each phase's end, in radii for an ellipse
-    - with events `final_time` (N,) in s
+    - with events `final_time` (N,) in s, and `arrived` (N,): whether every phase with an `end` ended by it
     - with scores `draw` (N, k)
 
     `observe_phase=False` shows tau and phi as 0, and `observe_velocity=False` the velocities. `observe_draw` adds the
@@ -105,6 +105,7 @@ class PhasedVectorEnv(BatchedEnv):
         self._step_in_phase = np.zeros(num_envs, dtype=np.int64)
         self._costs = {part: np.zeros(num_envs) for part in problem.parts}
         self._bonus = np.zeros(num_envs)
+        self._arrived = np.ones(num_envs, dtype=bool)
         self._terminal_error = np.zeros((num_envs, len(problem.phases)))
 
     def _observation_box(self):
@@ -194,6 +195,7 @@ class PhasedVectorEnv(BatchedEnv):
             part[mask] = 0.0
         for array in (self.time, self._bonus, self._terminal_error):
             array[mask] = 0.0
+        self._arrived[mask] = True
         self._phase[mask] = 0
         self._step_in_phase[mask] = 0
 
@@ -231,7 +233,8 @@ class PhasedVectorEnv(BatchedEnv):
         before, phase = self.x, self.phase
         length = np.full(self.num_envs, problem.dt)
         controls = problem.as_control(u)
-        self.x, running = self._fly(before, controls, phase, problem.dt)
+        with np.errstate(over="ignore", invalid="ignore"):  # what diverges is refused below
+            self.x, running = self._fly(before, controls, phase, problem.dt)
         running = np.zeros(self.num_envs) + running  # a table's `running` may be one number for all
         if self._has_events:
             has_ended = self._phase >= len(problem.phases)  # ended in an earlier step and not reset, so it stays
@@ -239,7 +242,9 @@ class PhasedVectorEnv(BatchedEnv):
         ends = self._step_in_phase + 1 == self._steps[phase]
         for k, event in self._moves:
             met = self._end_by_event(k, event, before, controls, running, length)
+            self._arrived &= met | ~ends | (self._phase != k)
             ends = ends | met
+        self._refuse_divergence()
         costs = self._step_costs(before, u, running, length, phase)
         for part, cost in costs.items():
             self._costs[part] += cost
@@ -251,6 +256,20 @@ class PhasedVectorEnv(BatchedEnv):
         if ends.any():
             rewards += self._end_phase(np.flatnonzero(ends))
         return rewards, self._phase >= len(problem.phases), self._final_info
+
+    def _refuse_divergence(self):
+        """Raise BadInput that names the first state that is not finite after this step."""
+        x = np.array(self.x)
+        is_finite = np.isfinite(x)
+        if is_finite.all():
+            return
+        bad = int(np.argmin(is_finite.all(axis=0)))
+        k = int(np.argmin(is_finite[:, bad]))
+        name = self.problem.x_names[k] if self.problem.x_names else f"x{k + 1}"
+        raise BadInput(
+            f"the state {name} of {self.problem.env_id} is {x[k, bad]} after step {self.t[bad]} of env {bad}; "
+            "it must be finite: the dynamics diverge"
+        )
 
     def _fly(self, x, u, phase, h):
         """The states h seconds later, and the integral of `running` over them, by the phase of each environment."""
@@ -370,6 +389,7 @@ class PhasedVectorEnv(BatchedEnv):
         info = {"episodic_return": self._bonus - cost, "cost": cost, **parts, "hit": hit, "terminal_error": error}
         if self._has_events:
             info["final_time"] = self.time.copy()
+            info["arrived"] = self._arrived.copy()
         if self.problem.scores:
             info["draw"] = self.draw.copy()
         return info

@@ -15,6 +15,8 @@ from drawing.time_plots import plot_flight, time_panels
 from phased.metrics import NEAR_ORIGIN, comparable, cost_parts, cost_ratio
 from phased.problem import Phase, Problem
 
+NOT_ARRIVED = {"color": "black", "marker": "x", "linestyle": "", "zorder": 6}
+
 
 def trajectories_figure(problem: Problem, arrays: dict, title: str) -> Figure:
     """Phase plane, position, velocity and control of the first ten starts, with targets and the phases' ends.
@@ -60,11 +62,27 @@ def time_figure(problem: Problem, arrays: dict, title: str) -> Figure:
     mark_table(problem, panels)
     figure.suptitle(with_count(problem, arrays, title))
     handles = handles_of([POLICY, OPTIMUM])
+    late = flights_out_of_time(arrays)
+    for flight in late:
+        for k, ax in enumerate(panels[: problem.states]):
+            ax.plot(flight[0], flight[1][k], **NOT_ARRIVED)
+    if late:
+        handles.append(Line2D([], [], **NOT_ARRIVED, label="did not arrive"))
     if any(phase.target is not None for phase in problem.phases):
         handles.append(Line2D([], [], **TARGET, linestyle="--", label="target"))
     handles.append(Line2D([], [], **BOUNDARY, label="bound, or end of a phase"))
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
     return figure
+
+
+def flights_out_of_time(arrays: dict) -> list[tuple]:
+    """The final time and state of the shown flights of the policy that did not arrive."""
+    arrived = arrays.get("arrived", np.ones(len(arrays["x"]), dtype=bool))
+    ends = []
+    for k in np.flatnonzero(~arrived[:SHOWN]):
+        last = int(np.isfinite(arrays["x"][k]).all(axis=1).sum()) - 1
+        ends.append((arrays["final_time"][k], arrays["x"][k, last]))
+    return ends
 
 
 def with_count(problem: Problem, arrays: dict, title: str) -> str:
@@ -150,7 +168,7 @@ def costs_figure(problem: Problem, arrays: dict, title: str) -> Figure:
     panels["all"].hist(reference_cost, bins, histtype="step", color="tab:blue", linewidth=1.4, label="optimum")
     panels["all"].set(xlabel="total cost J", ylabel="starts", title=f"All {len(cost)} starts")
     plot_bars(panels["total"], cost, reference_cost, "total cost J")
-    chosen = comparable(problem, arrays["x"], arrays["x_reference"]) & (reference_cost != 0)
+    chosen = comparable(problem, arrays) & (reference_cost != 0)
     ratio = cost_ratio(cost, np.where(chosen, reference_cost, 1.0))
     for k in range(min(SHOWN, len(cost))):
         text = f"{ratio[k]:.3f}" if chosen[k] else "miss"  # a missed circle forbids a ratio

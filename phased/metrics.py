@@ -24,6 +24,7 @@ def flight_metrics(problem: Problem, flight: dict, reference: dict) -> dict:
         metrics[f"{prefix}hit_rate"] = float(result["hit"].all(axis=1).mean())
         if problem.has_events:
             metrics[f"{prefix}final_time_mean"] = float(result["final_time"].mean())
+            metrics[f"{prefix}arrival_rate"] = float(result["arrived"].mean())
     for k, rate in enumerate(flight["hit"].mean(axis=0), start=1):
         metrics[f"hit_rate_phase_{k}"] = float(rate)
     metrics["terminal_error_max"] = float(flight["terminal_error"].max())
@@ -46,15 +47,18 @@ def hits_every_circle(problem: Problem, x: np.ndarray) -> np.ndarray:
     return hits
 
 
-def comparable(problem: Problem, x: np.ndarray, x_reference: np.ndarray) -> np.ndarray:
-    """The starts (n,) whose costs may be compared: all, or if circles count, those from which both sides hit them all.
+def comparable(problem: Problem, arrays: dict) -> np.ndarray:
+    """The starts (n,) whose costs may be compared: those from which both sides arrive and hit every circle that counts.
 
     Skipping a circle is cheaper than hitting it, so a miss would count as better than the optimum. An optimum that hits
     every circle is the radius-constrained optimum, even if the constraint did not have to be imposed.
     """
-    if not problem.circles_count:
-        return np.ones(len(x), dtype=bool)
-    return hits_every_circle(problem, x) & hits_every_circle(problem, x_reference)
+    compared = np.ones(len(arrays["x"]), dtype=bool)
+    for suffix in ("", "_reference"):
+        if problem.circles_count:
+            compared &= hits_every_circle(problem, arrays[f"x{suffix}"])
+        compared &= arrays.get(f"arrived{suffix}", True)  # an older file does not say it
+    return compared
 
 
 def ratio_metrics(cost: np.ndarray, reference_cost: np.ndarray, eval_seed: int) -> dict:

@@ -7,7 +7,6 @@ solutions. CasADi is imported only where it is used.
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import suppress
 from functools import cache
 from typing import NamedTuple
 
@@ -21,6 +20,11 @@ from phased.problem import PROBLEMS, Phase, Problem
 
 FIRST_STEPS = 40  # most steps of a phase with an event, while its length is unknown
 HELD_TRIES = 4  # other numbers of steps that are tried when its length is known
+AIMS = (1e-9, 1e-7, 1e-5)  # how far inside its circles and past its events a solution is aimed that misses them
+AGREEMENT = 1e-6  # largest relative difference of costs that count as the same optimum
+ENOUGH = 2  # guesses that have to lead to the best solution, or more are tried
+ALWAYS = 2  # further guesses that are tried in any case
+MOST_HISTORIES = 12  # random histories of the controls that are tried
 
 
 class PhaseMesh(NamedTuple):
@@ -147,6 +151,7 @@ def solver(problem: Problem, mesh: PhaseMesh, defect: Callable, in_circles: bool
         "print_time": False,
         "ipopt.print_level": 0,
         "ipopt.sb": "yes",
+        "show_eval_warnings": False,  # IPOPT takes a shorter step where a function is NaN
         "ipopt.tol": 1e-10,
         "ipopt.bound_relax_factor": 0,  # the default lets solutions end 2.5e-7 outside their circle
         "ipopt.max_wall_time": limit["seconds"],
@@ -295,18 +300,50 @@ def guesses(problem: Problem, x0, draw):
     yield [resting(phase, np.tile(end, (phase.steps + 1, 1))) for phase, end in zip(problem.phases, corners[1:])]
     if problem.single_optimum:
         return
-    lines = zip(problem.phases, corners[:-1], corners[1:])
-    yield [resting(phase, np.linspace(begin, end, phase.steps + 1)) for phase, begin, end in lines]
+    if not np.array_equal(corners[:-1], corners[1:]):  # without targets the lines are the rest
+        lines = zip(problem.phases, corners[:-1], corners[1:])
+        yield [resting(phase, np.linspace(begin, end, phase.steps + 1)) for phase, begin, end in lines]
     for policy in guess_policies(problem):
-        with suppress(BadInput), np.errstate(all="ignore"):  # an overflowing state gives an action that is refused
-            sketches = flown_sketches(problem, policy, x0, draw)
-            if sketches is not None:
-                yield sketches
+        sketches = flown_sketches(problem, policy, x0, draw)
+        if sketches is not None:
+            yield sketches
+
+
+def further_guesses(problem: Problem, x0, draw):
+    """Yield guesses for a table with events or with costs by functions: flights of controls that change with time.
+
+    The first flight sweeps each control from 10 % to 90 % of its range. The others follow lines through 2 to 4 random
+    values. Their seeds are fixed, so all starts have the same ones. On Bryson and Ho's orbit raising the constants of
+    `guess_policies` end in a local optimum. The sweep reaches the best one, and so does a tenth of the random
+    histories. Random controls at each step do not.
+    """
+    if problem.single_optimum or problem.weighted and not problem.has_events:
+        return
+    low, high = problem.u_box
+    anchors = [low + np.array([[0.1], [0.9]]) * (high - low)]
+    for seed in range(MOST_HISTORIES):
+        rng = np.random.default_rng(seed)
+        anchors.append(rng.uniform(low, high, (2 + seed % 3, problem.controls)))
+    for values in anchors:
+        own_times = np.linspace(0, problem.steps - 1, len(values))
+        history = np.column_stack([np.interp(np.arange(problem.steps), own_times, row) for row in values.T])
+        sketches = flown_sketches(problem, policy_of(history), x0, draw)
+        if sketches is not None:
+            yield sketches
+
+
+def policy_of(u: np.ndarray) -> Callable:
+    """The policy of one flight that applies the controls u (K, m), and then holds the last one."""
+    return lambda obs, t: u[min(t, len(u) - 1)][None]
 
 
 def flown_sketches(problem: Problem, policy, x0, draw) -> list[Sketch] | None:
     """The flight of a policy as sketches. None if it diverges, or if there are events and several phases."""
-    flight = fly(problem.env_id, policy, x0[None], draw[None])
+    try:
+        with np.errstate(all="ignore"):
+            flight = fly(problem.env_id, policy, x0[None], draw[None])
+    except BadInput:  # a state that overflows is refused
+        return None
     x = flight["x"][0]
     u = flight["u"][0].reshape(problem.steps, problem.controls)
     if problem.has_events:
@@ -342,15 +379,45 @@ class Solution(NamedTuple):
     multipliers: np.ndarray  # of the circles' constraints
     bound_price: float  # the least `Problem.bound_price` with which crossing a bound does not pay
     status: str  # IPOPT's return status
+    guesses: int = 1  # guesses that were tried
+    guesses_agree: int = 1  # those that lead to this cost
 
     @property
     def succeeded(self) -> bool:
         return self.status in ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 
 
-def solve_on(problem: Problem, mesh: PhaseMesh, job: StartJob, sketches: list[Sketch]) -> Solution:
-    """Solve a job on a mesh, from a guess."""
+def aimed(problem: Problem, mesh: PhaseMesh, job: StartJob, sketches: list[Sketch], aim: float) -> dict:
+    """The arguments of `solver` with circles that are smaller by the share `aim`, and with ends past their events.
+
+    An event's value is at least the share `aim` of its largest value on the way until the end, where it is -`aim`.
+    """
+    _, arguments = solver(problem, mesh, job.defect, job.in_circles)
+    low = arguments["lbg"].copy()
+    high = arguments["ubg"].copy()
+    begin = problem.states * sum(mesh.counts)
+    if job.in_circles:
+        circles = sum(phase.has_circle for phase in problem.phases)
+        high[begin : begin + circles] = (1 - aim) ** 2
+        begin += circles
+    hidden = tuple(float(value[0]) for value in problem.hidden(job.draw[None]))
+    for phase, count, sketch in zip(problem.phases, mesh.counts, sketches):
+        if phase.end is None:
+            continue
+        values = problem.with_parameters(phase.end, hidden)(tuple(sketch.x.T))
+        past = aim * np.abs(values).max()
+        last = begin + count - 1
+        low[begin:last] = past
+        low[last] = high[last] = -past
+        begin += count
+    return {**arguments, "lbg": low, "ubg": high}
+
+
+def solve_on(problem: Problem, mesh: PhaseMesh, job: StartJob, sketches: list[Sketch], aim: float = 0.0) -> Solution:
+    """Solve a job on a mesh, from a guess. `aim` is how far it is `aimed` beyond what it has to reach."""
     solve, arguments = solver(problem, mesh, job.defect, job.in_circles)
+    if aim:
+        arguments = aimed(problem, mesh, job, sketches, aim)
     p = [float(value[0]) for value in problem.hidden(job.draw[None])]
     found = solve(p=np.concatenate([job.x0, p]), x0=placed(problem, mesh, sketches), **arguments)
     begin = problem.states * sum(mesh.counts)
@@ -364,13 +431,12 @@ def solve_on(problem: Problem, mesh: PhaseMesh, job: StartJob, sketches: list[Sk
     return Solution(mesh, unknowns, float(found["f"]), multipliers, bound_price, status)
 
 
-def held_steps(problem: Problem, job: StartJob, stretched: Solution) -> Solution:
-    """The solution in the environment's own steps, from a stretched one that has found out how long the phases are.
+def held_steps(problem: Problem, job: StartJob, sketches: list[Sketch]) -> Solution:
+    """The solution in the environment's own steps, from the sketches of one that knows how long the phases are.
 
-    The number of steps is first that of the stretched solution. If the last step of a phase has the length 0 or dt, one
-    step less or more may be better, and is tried.
+    The number of steps is first that of the sketches. If the last step of a phase has the length 0 or dt, one step less
+    or more may be better, and is tried.
     """
-    sketches = sketches_of(problem, stretched.mesh, job.x0, stretched.unknowns)
 
     def steps_of(sketch, phase):
         whole = int(np.ceil(sketch.seconds / problem.dt - 1e-9))
@@ -397,28 +463,108 @@ def held_steps(problem: Problem, job: StartJob, stretched: Solution) -> Solution
     return best
 
 
+def agrees(cost: float, other: float) -> bool:
+    """Whether two solutions cost the same, up to `AGREEMENT`."""
+    return abs(cost - other) <= AGREEMENT * max(abs(other), 1e-4)
+
+
+def solve_guess(problem: Problem, job: StartJob, guess: list[Sketch]) -> Solution:
+    """The solution in the environment's steps that a guess leads to."""
+    solution = solve_on(problem, PhaseMesh.of(problem), job, guess)
+    if solution.succeeded and problem.has_events:
+        return held_steps(problem, job, sketches_of(problem, solution.mesh, job.x0, solution.unknowns))
+    return solution
+
+
+def solutions_of(problem: Problem, job: StartJob) -> list[Solution]:
+    """What the guesses lead to, solved or not: first `guesses`, then `further_guesses` until enough agree.
+
+    The stored optima keep their bits: a solution of the further guesses stands before the others only if it is better
+    by more than `AGREEMENT`.
+    """
+    found = [solve_guess(problem, job, guess) for guess in guesses(problem, job.x0, job.draw)]
+    solved = sorted((solution for solution in found if solution.succeeded), key=lambda solution: solution.cost)
+    for number, guess in enumerate(further_guesses(problem, job.x0, job.draw), start=1):
+        if number > ALWAYS and sum(agrees(solution.cost, solved[0].cost) for solution in solved) >= ENOUGH:
+            break
+        solution = solve_guess(problem, job, guess)
+        found.append(solution)
+        if not solution.succeeded:
+            continue
+        is_better = [not agrees(solution.cost, other.cost) and solution.cost < other.cost for other in solved]
+        solved.insert(is_better.index(True) if True in is_better else len(solved), solution)
+    return [*solved, *(solution for solution in found if not solution.succeeded)]
+
+
+def controls_of(problem: Problem, solution: Solution) -> np.ndarray:
+    """The controls (T, m) of a solution in the environment's steps. The last one is held after an event."""
+    u = solution.unknowns[: problem.controls * sum(solution.mesh.counts)].reshape(-1, problem.controls)
+    return np.vstack([u, np.tile(u[-1], (problem.steps - len(u), 1))])
+
+
+def why_it_misses(problem: Problem, job: StartJob, solution: Solution) -> str | None:
+    """Why the environment's flight of a solution is no solution, in words. None if it arrives and hits every circle."""
+    try:
+        with np.errstate(all="ignore"):
+            flight = fly(problem.env_id, policy_of(controls_of(problem, solution)), job.x0[None], job.draw[None])
+    except BadInput:  # after an event that it does not meet, a flight can diverge
+        return "does not meet the event `end`, and diverges"
+    if problem.has_events and not flight["arrived"][0]:
+        return "does not meet the event `end`"
+    if not job.in_circles:
+        return None
+    for k, phase in enumerate(problem.phases):
+        if not flight["hit"][0, k]:
+            distance = flight["terminal_error"][0, k]
+            return f"ends phase {k + 1} at a distance of {distance:.12g}, outside its circle of {phase.circle_radius:g}"
+    return None
+
+
+def that_arrives(problem: Problem, job: StartJob, solved: list[Solution]) -> Solution:
+    """The first of the solutions that agree with the best one and arrive in flight, or the best one aimed anew.
+
+    A solution may miss its event or circle by rounding. Raises NoOptimum if none arrives.
+    """
+    best = solved[0]
+    if job.defect is not shooting or not (job.in_circles or problem.has_events):
+        return best
+    why = why_it_misses(problem, job, best)
+    if why is None:
+        return best
+    for other in solved[1:]:
+        if agrees(other.cost, best.cost) and why_it_misses(problem, job, other) is None:
+            return other
+    sketches = sketches_of(problem, best.mesh, job.x0, best.unknowns)
+    for aim in AIMS:
+        other = solve_on(problem, best.mesh, job, sketches, aim)
+        if other.succeeded and why_it_misses(problem, job, other) is None:
+            return other
+    raise NoOptimum(f"the best flight from {named(job)} {why}")
+
+
+def named(job: StartJob) -> str:
+    """A start in a message."""
+    return f"start {job.index}, x0 = {job.x0.tolist()}, of {job.env_id}"
+
+
 @interruptible()
 def best_solution(job: StartJob) -> tuple[Solution, bool]:
-    """The best solution of a start's guesses in the environment's steps, and whether IPOPT succeeded.
+    """The best solution of a start's guesses in the environment's steps that arrives, and whether IPOPT succeeded.
 
-    Raises NoOptimum if no guess leads to a solution, unless circles, bounds or events are out of reach.
+    Raises NoOptimum if no guess leads to a solution that arrives, unless circles, bounds or events are out of reach.
     """
     problem = PROBLEMS[job.env_id]
-    mesh = PhaseMesh.of(problem)
-    found: list[Solution] = []
-    for guess in guesses(problem, job.x0, job.draw):
-        solution = solve_on(problem, mesh, job, guess)
-        if solution.succeeded and problem.has_events:
-            solution = held_steps(problem, job, solution)
-        found.append(solution)
+    found = solutions_of(problem, job)
     solved = [solution for solution in found if solution.succeeded]
     statuses = dict.fromkeys(solution.status for solution in found)
     # circles, bounds and events can be out of reach; without them every control has a trajectory
     can_be_infeasible = job.in_circles or problem.bounds or problem.has_events
     if not solved and not (can_be_infeasible and "Infeasible_Problem_Detected" in statuses):
-        where = f"start {job.index}, x0 = {job.x0.tolist()}, of {job.env_id}"
-        raise NoOptimum(f"{where}: IPOPT stopped with {', '.join(statuses)}{why_it_stopped(statuses)}")
-    return min(solved, key=lambda solution: solution.cost, default=found[0]), bool(solved)
+        raise NoOptimum(f"{named(job)}: IPOPT stopped with {', '.join(statuses)}{why_it_stopped(statuses)}")
+    if not solved:
+        return found[0], False
+    agree = sum(agrees(solution.cost, solved[0].cost) for solution in solved)
+    return that_arrives(problem, job, solved)._replace(guesses=len(found), guesses_agree=agree), True
 
 
 @interruptible()
@@ -427,6 +573,18 @@ def refined(job: StartJob, best: Solution, factor: int) -> Solution:
     problem = PROBLEMS[job.env_id]
     sketches = sketches_of(problem, best.mesh, job.x0, best.unknowns)
     return solve_on(problem, best.mesh.refined(factor), job, sketches)
+
+
+@interruptible()
+def coarse(job: StartJob, best: Solution, finer: Solution) -> Solution:
+    """The solution in the environment's own steps, from a finer one, whose controls are averaged over each step."""
+    problem = PROBLEMS[job.env_id]
+    sketches = []
+    for count, sketch in zip(best.mesh.counts, sketches_of(problem, finer.mesh, job.x0, finer.unknowns)):
+        sketches.append(sketch._replace(u=sketch.u.reshape(count, -1, problem.controls).mean(axis=1)))
+    if problem.has_events:
+        return held_steps(problem, job, sketches)
+    return solve_on(problem, best.mesh, job, sketches)
 
 
 def why_it_stopped(statuses) -> str:

@@ -21,6 +21,7 @@ def table(problem: Problem, metrics: dict) -> str:
 def cost_rows(problem: Problem, metrics: dict) -> list[tuple]:
     """The cost, its parts, and the reward: label, optimum, ours, ratio."""
     all_compared = not problem.circles_count or metrics["hit_rate"] == metrics["reference_hit_rate"] == 1
+    all_compared &= metrics.get("compared_starts", metrics["eval_starts"]) == metrics["eval_starts"]
     parts = {f"cost_{part}": f"  of it: {part}" for part in problem.parts}
     optimum = metrics["reference_cost_mean"]
     ours = metrics["cost_mean"]
@@ -45,11 +46,15 @@ def row(label: str, optimum: float, ours: float, ratio: float | None) -> tuple:
 
 
 def hit_rows(problem: Problem, metrics: dict) -> list[tuple]:
-    """The shares of starts that hit their circles: label, optimum, ours, ratio."""
+    """The shares of flights that arrive, and of starts that hit their circles: label, optimum, ours, ratio."""
+    rows = []
+    if "arrival_rate" in metrics:  # not in an older eval.json
+        rate = f"{metrics['arrival_rate']:.1%}"
+        rows.append(("flights that arrive", f"{metrics['reference_arrival_rate']:.1%}", rate, "-"))
     if not any(phase.has_circle for phase in problem.phases):
-        return []
+        return rows
     label = "starts that hit every circle" if problem.waypoints else "starts that hit the target circle"
-    rows = [(label, f"{metrics['reference_hit_rate']:.1%}", f"{metrics['hit_rate']:.1%}", "-")]
+    rows.append((label, f"{metrics['reference_hit_rate']:.1%}", f"{metrics['hit_rate']:.1%}", "-"))
     if problem.waypoints:
         for k, phase in enumerate(problem.phases, start=1):
             if not phase.has_circle:
@@ -62,11 +67,17 @@ def hit_rows(problem: Problem, metrics: dict) -> list[tuple]:
 def ratio_lines(problem: Problem, metrics: dict) -> list[str]:
     """The lines below the table: the statistics of the cost ratio, or why there is none."""
     if "ratio_of_sums" not in metrics:
+        if metrics.get("compared_starts") == 0:
+            reason = "no flight arrives" if metrics["arrival_rate"] == 0 else "no flight arrives and hits every circle"
+            return [f"  No cost ratio: {reason} (0 of {metrics['eval_starts']} are compared)."]
         if not problem.circles_count:
             return ["  No cost ratio: the optimum costs nothing."]
         reason = "no start hit every circle" if metrics["hit_rate"] == 0 else "where ours hit, the optimum does not"
         return [f"  No cost ratio: {reason} (missing a circle is cheaper, not better)."]
     over = "the starts that hit every circle" if problem.circles_count else f"all {metrics['eval_starts']} starts"
+    if "compared_starts" in metrics:
+        both = "arrive and hit every circle" if problem.circles_count else "arrive"
+        over = f"{metrics['compared_starts']} of {metrics['eval_starts']} starts, whose flights {both}"
     if problem.has_one_flight:
         return [f"  Cost ratio ours / optimum: {metrics['ratio_of_sums']:.4f}"]
     lines = [f"  Cost ratio ours / optimum over {over}:"]

@@ -42,17 +42,25 @@ class PhasedTask(SampledTask):
             reference = self.optimum(eval_seed, n)
         if not np.array_equal(reference["x"][:, 0], x0):
             raise ValueError(f"reference does not belong to the {n} starts of eval_seed {eval_seed}")
-        compared = flight["hit"].all(axis=1) & reference["hit"].all(axis=1) | (not problem.circles_count)
+        compared = np.ones(n, dtype=bool)
+        for side in (flight, reference):
+            if problem.circles_count:
+                compared &= side["hit"].all(axis=1)
+            if problem.has_events:
+                compared &= side["arrived"]
         costs = flight["cost"][compared], reference["cost"][compared]
         metrics = {"env_id": self.env_id, "eval_seed": eval_seed, "eval_starts": n}
         metrics |= flight_metrics(problem, flight, reference)
+        if problem.has_events:
+            metrics["compared_starts"] = int(compared.sum())
         metrics |= ratio_metrics(*costs, eval_seed)
         metrics |= near_origin_metrics(problem, x0[compared], *costs)
         arrays = {"t": problem.dt * np.arange(problem.steps + 1)}
         arrays |= {key: flight[key] for key in ("x", "u", "reward", "cost")}
         arrays |= {f"{key}_reference": reference[key] for key in ("x", "u", "cost")}
         if problem.has_events:
-            arrays |= {"final_time": flight["final_time"], "final_time_reference": reference["final_time"]}
+            for key in ("final_time", "arrived"):
+                arrays |= {key: flight[key], f"{key}_reference": reference[key]}
         if problem.scores:
             arrays["draw"] = draw
         return metrics, arrays
@@ -70,28 +78,46 @@ class PhasedTask(SampledTask):
         return table(self.problem, metrics)
 
     def seed_rows(self) -> dict[str, tuple[str, str]]:
-        return {
+        rows = {
             "ratio_of_sums": ("ratio of sums", ".4f"),
             "ratio_mean": ("mean ratio", ".4f"),
             "ratio_median": ("median ratio", ".4f"),
             "ratio_p95": ("p95", ".4f"),
             "loss_near_origin_mean": ("mean loss near the origin", ".4f"),
+            "arrival_rate": ("flights that arrive", ".1%"),
             "hit_rate": ("starts that hit every circle", ".1%"),
         }
+        if not any(phase.has_circle for phase in self.problem.phases):
+            del rows["hit_rate"]
+        return rows
 
     def progress_keys(self, **env_options) -> list[str]:
-        return ["ratio_of_sums", "ratio_p95"]
+        arrivals = ["arrival_rate"] if self.problem.has_events else []
+        return ["ratio_of_sums", "ratio_p95", *arrivals]
 
     def headline(self, metrics: dict) -> str:
         """A figure's title: the problem and how close to the optimum the policy flies."""
         if "ratio_of_sums" not in metrics:
-            return f"{self.env_id}: no cost ratio, {metrics['hit_rate']:.1%} of the starts hit every circle"
+            shares = self.shares(metrics)
+            return f"{self.env_id}: no cost ratio{', ' if shares else ''}{shares}"
         title = f"{self.env_id}: cost {metrics['ratio_of_sums']:.4f} x optimum"
         if self.problem.has_one_flight:
             return title
+        if "arrival_rate" in metrics:
+            counts = f"{metrics['compared_starts']} of {metrics['eval_starts']} starts"
+            return f"{title} over {counts}: {self.shares(metrics)}"
         if self.problem.circles_count:
             return f"{title} over the starts that hit every circle ({metrics['hit_rate']:.1%})"
         return f"{title} ({metrics['eval_starts']} starts)"
+
+    def shares(self, metrics: dict) -> str:
+        """The shares of flights that arrive and of starts that hit, of a table that can miss them."""
+        words = []
+        if "arrival_rate" in metrics:
+            words.append(f"{metrics['arrival_rate']:.1%} of the flights arrive")
+        if self.problem.circles_count:
+            words.append(f"{metrics['hit_rate']:.1%} of the starts hit every circle")
+        return ", ".join(words)
 
     def figures(self, arrays: dict, metrics: dict, curves: list[dict]) -> dict:
         from drawing.training import Miss, training_figure

@@ -12,7 +12,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
-from helpers import NETWORK
+from helpers import NETWORK, headline_of
 from scipy.integrate import solve_ivp
 from scipy.special import erf
 from scipy.stats import norm
@@ -81,6 +81,37 @@ def test_a_soft_touchdown_between_steps_is_seen(new_problem, speed, touches):
     flight = fly(env_id, hold(G + 10.0), np.array([[0.045, speed]]))
     time = 0.1 - math.sqrt(0.01 - 0.009) if touches else 0.5
     assert flight["final_time"][0] == pytest.approx(time, rel=1e-10)
+
+
+def test_a_flight_arrives_only_by_its_event(new_problem):
+    """In 1 s a stone falls 4.9 m: from 4.8 m it arrives, from 5 m its time is over first."""
+    phases = (Phase(steps=10, end=lambda x: x[0], running=lambda x, u: 1.0),)
+    env_id = new_problem(free_fall("Late-v0", phases=phases))
+    x0 = np.array([[4.8, 0.0], [5.0, 0.0]])
+    flight = fly(env_id, hold(0.0), x0)
+    assert flight["arrived"].tolist() == [True, False]
+    assert flight["final_time"] == pytest.approx([math.sqrt(2 * 4.8 / G), 1.0], rel=1e-12)
+
+
+def test_costs_are_compared_over_the_flights_that_arrive(new_problem):
+    """Without thrust the stone falls as fast as the optimum; held up it never arrives, and has no ratio."""
+    env_id = new_problem(free_fall("Arrival-v0", x0=(1.0, 0.0), x0_max=0.0))
+    falls, _ = task_of(env_id).evaluate(hold(0.0), 0, 1)
+    floats, _ = task_of(env_id).evaluate(hold(G), 0, 1)
+    assert (falls["arrival_rate"], floats["arrival_rate"], floats["compared_starts"]) == (1, 0, 0)
+    assert floats["cost_mean"] == pytest.approx(4.0) and "ratio_of_sums" not in floats
+    for metrics in (falls, floats):
+        assert "hit" not in headline_of(metrics)
+        assert "flights that arrive" in task_of(env_id).table(metrics)
+
+
+def test_a_state_that_diverges_is_named(new_problem):
+    """x' = x^3 from 1 leaves every bound at t = 0.5."""
+    phase = Phase(steps=20, target=(0.0, 0.0), R=0.1, Qf=1.0)
+    table = Problem("Cubed-v0", lambda x, u: (x[0] ** 3 + u, -x[1]), 1.0, (phase,), (99.0, 99.0), x0_max=0.1)
+    env_id = new_problem(table)
+    with pytest.raises(BadInput, match="^the state x1 of Cubed-v0 is .* after step [0-9]+ of env 1; it must be finite"):
+        fly(env_id, hold(0.0), np.array([[0.0, 0.0], [1.0, 0.0]]))
 
 
 def test_a_flight_does_not_depend_on_its_neighbours(new_problem):
