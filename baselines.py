@@ -266,6 +266,8 @@ def summarise(problem: Problem, flight: dict) -> dict:
     if problem.waypoints:
         numbers |= {f"hit_rate_phase_{k}": rate for k, rate in enumerate(flight["hit"].mean(axis=0), start=1)}
     numbers |= {"terminal_error_max": flight["terminal_error"].max(), "control_max": np.nanmax(np.abs(flight["u"]))}
+    if problem.constraints:
+        numbers["constraint_max"] = flight["constraint_max"].max()
     if problem.has_events:
         numbers["final_time_mean"] = flight["final_time"].mean()
     if "replay_error" in flight:
@@ -334,13 +336,16 @@ def compare_finer(env_id: str, x0, flight: dict, draw) -> dict:
     best = [best_solution(job)[0] for job in jobs]
     doubtful = min(best, key=lambda solution: solution.guesses_agree)
     numbers = {"guesses": doubtful.guesses, "guesses_agree": doubtful.guesses_agree}
-    if problem.bounds:
-        needed = max(solution.bound_price for solution in best)
-        numbers["bound_price_needed"] = needed if needed > 1e-6 else 0.0
-        if needed > problem.bound_price:
-            print(
-                f"bound_price {problem.bound_price:g} is less than {needed:g}: crossing a bound pays", file=sys.stderr
-            )
+    for name, limits in (("bound_price", problem.bounds), ("constraint_price", problem.constraints)):
+        if not limits:
+            continue
+        needed = max(getattr(solution, name) for solution in best)
+        price = getattr(problem, name)
+        numbers[f"{name}_needed"] = needed if needed > 1e-6 else 0.0
+        if needed > price:
+            print(f"{name} {price:g} is less than {needed:g}: crossing a limit pays", file=sys.stderr)
+    if problem.step is not None:  # its steps are no approximation
+        return numbers
     for name, defect in (("finer", shooting), ("finer_collocation", hermite_simpson)):
         finer = [refined(job._replace(defect=defect), solution, FINER) for job, solution in zip(jobs, best)]
         costs = np.array([solution.cost for solution in finer])
@@ -374,7 +379,8 @@ def compare(env_id: str, x0, flight: dict, draw) -> dict:
     problem = PROBLEMS[env_id]
     if env_id == DOUBLE_INTEGRATOR.env_id:
         return compare_double_integrator(env_id, x0, flight)
-    if not problem.weighted or problem.has_events or problem.scores or problem.bounds:
+    more = [problem.has_events, problem.scores, problem.bounds, problem.constraints, problem.step]
+    if not problem.weighted or any(more):
         return compare_finer(env_id, x0, flight, draw)
     if problem.circles_count:
         return compare_waypoints(env_id, flight)

@@ -19,7 +19,7 @@ def page(task: PhasedTask, metrics: dict, arrays: dict, checkpoint: dict, launch
     Raises BadInput if the problem is not written in JavaScript, or if the policy has other features.
     """
     problem = task.problem
-    f = problem.f
+    f = problem.step or problem.f
     known = f.__module__ == "envs" and f.__name__ in DYNAMICS
     allowed = f"must be one of envs.py's {', '.join(DYNAMICS)}, which are written in JavaScript, too"
     refuse_unless(known, f"the dynamics of {problem.env_id}", f"{f.__module__}.{f.__name__}", allowed)
@@ -44,7 +44,8 @@ def page(task: PhasedTask, metrics: dict, arrays: dict, checkpoint: dict, launch
 def is_plain(problem: Problem) -> bool:
     """Whether the page's physics has all that the table has."""
     more = [problem.has_events, problem.scores, problem.bounds, problem.x0, problem.u_norm, problem.substeps > 1]
-    more += [phase.f is not None for phase in problem.phases]
+    more += [problem.constraints]
+    more += [phase.f is not None or phase.conditions is not None for phase in problem.phases]
     aimed = all(None not in problem.targets_of(phase) for phase in problem.phases)
     return problem.weighted and aimed and problem.controls == 1 and not any(more)
 

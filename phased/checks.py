@@ -19,10 +19,11 @@ def check_problem(problem):
     """Refuse a `Problem` that cannot be flown. Sizes and signs are checked first, then its functions are tried."""
     named = isinstance(problem.env_id, str) and ENV_ID.fullmatch(problem.env_id)
     refuse_unless(named, "env_id", repr(problem.env_id), "must be letters, digits, _ . - and a version, as 'Mine-v0'")
-    for name in ("f", "parameters", "guess"):
+    for name in ("f", "step", "constraints", "parameters", "guess"):
         function = getattr(problem, name)
-        possible = callable(function) or (name != "f" and function is None)
-        refuse(problem, possible, name, function, "must be a function")
+        refuse(problem, callable(function) or function is None, name, function, "must be a function")
+    one_of_them = "must be given, or step(x, u), and not both"
+    refuse(problem, (problem.f is None) != (problem.step is None), "f", problem.f, one_of_them)
     check_numbers(problem)
     phases = problem.phases
     hint = "must be a tuple of at least one Phase (of one: a comma behind it)"
@@ -31,7 +32,19 @@ def check_problem(problem):
         shaped = all(hasattr(phase, name) for name in ("steps", "target", "radius"))
         refuse(problem, shaped, f"phases[{k - 1}]", phase, "must be a Phase")
         check_phase(problem, phase, k)
+    if problem.step is not None:
+        check_discrete(problem)
     try_functions(problem)
+
+
+def check_discrete(problem):
+    """What a table with `step` cannot have: nothing is integrated, and nothing ends within a step."""
+    allowed = "must be 1 with step(x, u), which nothing integrates"
+    refuse(problem, problem.substeps == 1, "substeps", problem.substeps, allowed)
+    for k, phase in enumerate(problem.phases, start=1):
+        for name in ("end", "f"):
+            function = getattr(phase, name)
+            refuse(problem, function is None, f"{name} of phase {k}", function, "must not be given with step(x, u)")
 
 
 def refuse(problem, possible, field: str, value, allowed: str):
@@ -149,9 +162,11 @@ def check_phase(problem, phase, k: int):
     check(not beyond, "target", f"must be within x_max {problem.x_max}")
     aimed = sum(value is not None for value in problem.targets_of(phase))
     is_radius = lambda value: isinstance(value, int | float) and value > 0  # noqa: E731
-    possible = is_radius(phase.radius) or is_tuple_of(is_radius, phase.radius, aimed)
+    count = None if callable(phase.conditions) else aimed  # how many conditions there are, a trial tells
+    possible = is_radius(phase.radius) or is_tuple_of(is_radius, phase.radius, count)
     check(possible, "radius", f"must be one positive number, or {aimed}, one for each state with a target")
-    check(not phase.has_circle or aimed > 0, "radius", "needs a target")
+    check(not phase.has_circle or aimed > 0 or phase.conditions is not None, "radius", "needs a target or conditions")
+    check(phase.conditions is None or phase.has_circle, "conditions", "need a radius, within which they are met")
     for name, count in (("R", m), ("Q", n)):
         value = getattr(phase, name)
         single = name == "R" and is_weight(value)
@@ -161,7 +176,7 @@ def check_phase(problem, phase, k: int):
     for name in ("Qf", "bonus"):
         check(is_weight(getattr(phase, name)), name, "must be a number of at least 0")
     check(not phase.bonus or phase.has_circle, "bonus", "needs a radius, within which it is paid")
-    for name in ("running", "terminal", "end", "f"):
+    for name in ("running", "terminal", "conditions", "end", "f"):
         function = getattr(phase, name)
         check(function is None or callable(function), name, "must be a function")
 
@@ -192,12 +207,19 @@ def try_functions(problem):
             check_size(problem, "guess", controls, problem.controls, "control")
         as_rows(problem, "guess", controls if isinstance(problem.u_max, tuple) else (controls,))
     for k, phase in enumerate(problem.phases, start=1):
-        f = problem.with_parameters(phase.f or problem.f, p)
-        name = "f" if phase.f is None else f"f of phase {k}"
-        derivatives = attempt(problem, name, f, x, u)
-        check_size(problem, name, derivatives, problem.states)
-        rows = as_rows(problem, name, derivatives)
-        check_alone(problem, name, phase.f or problem.f, (x, u), p, rows)
+        name = "step" if problem.f is None else "f" if phase.f is None else f"f of phase {k}"
+        dynamics = problem.step or phase.f or problem.f
+        check_tuple(problem, name, dynamics, (x, u), p, problem.states)
+        if phase.conditions is not None:
+            field = f"conditions of phase {k}"
+            conditions = phase.conditions
+            if problem.parameters is not None:
+                conditions = without_parameters(conditions)
+            count = check_tuple(problem, field, conditions, (x,), p, None)
+            aimed = sum(value is not None for value in problem.targets_of(phase))
+            fits = not isinstance(phase.radius, tuple) or len(phase.radius) == aimed + count
+            allowed = f"must be one number, or {aimed + count}: {aimed} for the target and {count} for the conditions"
+            refuse(problem, fits, f"radius of phase {k}", phase.radius, allowed)
         for name, arguments in (("running", (x, u)), ("terminal", (x,)), ("end", (x,))):
             function = getattr(phase, name)
             if callable(function):
@@ -208,7 +230,29 @@ def try_functions(problem):
                 above = name != "end" or k > 1 or (rows[0] >= 0).all()
                 allowed = "must not be below 0 at the starts: the phase ends when it falls through 0"
                 refuse_unless(above, f"{field} of {problem.env_id}", f"{np.min(rows[0]):.6g} at a start", allowed)
-        check_step(problem, phase, x, u, p)
+        if problem.step is None:
+            check_step(problem, phase, x, u, p)
+    if problem.constraints is not None:
+        check_tuple(problem, "constraints", problem.constraints, (x, u), p, None)
+        allowed = "must be positive with constraints"
+        refuse(problem, positive(problem.constraint_price), "constraint_price", problem.constraint_price, allowed)
+
+
+def check_tuple(problem, field: str, function: Callable, arguments, p, count: int | None) -> int:
+    """Raise BadInput unless a function returns a tuple of `count` numbers, any if None, for each flight.
+
+    Returns how many.
+    """
+    values = attempt(problem, field, problem.with_parameters(function, p), *arguments)
+    check_size(problem, field, values, count)
+    rows = as_rows(problem, field, values)
+    check_alone(problem, field, function, arguments, p, rows)
+    return len(rows)
+
+
+def without_parameters(function: Callable) -> Callable:
+    """A function that is called with p as its last argument, and does not take it."""
+    return lambda *arguments: function(*arguments[:-1])
 
 
 def last_flight(value):
@@ -229,9 +273,9 @@ def check_alone(problem, field: str, function: Callable, arguments, p, rows):
 def check_step(problem, phase, x, u, p):
     """Raise BadInput if a step is too long for its Runge-Kutta formula, so that two half steps end elsewhere."""
     with np.errstate(all="ignore"):
-        whole_step, _ = problem.step(phase, x, u, p, problem.dt)
-        half, _ = problem.step(phase, x, u, p, problem.dt / 2)
-        two_halves, _ = problem.step(phase, half, u, p, problem.dt / 2)
+        whole_step, *_ = problem.advance(phase, x, u, p, problem.dt)
+        half, *_ = problem.advance(phase, x, u, p, problem.dt / 2)
+        two_halves, *_ = problem.advance(phase, half, u, p, problem.dt / 2)
     size = problem.scale[:, None] + np.abs(np.array(two_halves))
     error = np.max(np.abs(np.array(whole_step) - two_halves) / size)
     allowed = f"is too long: a step misses by {error:.2g} of its state; it needs a smaller dt, or more substeps"
@@ -260,12 +304,18 @@ def attempt(problem, field: str, function: Callable, *arguments):
         raise BadInput(f"{field} of {problem.env_id} fails: {why}") from error
 
 
-def check_size(problem, field: str, values, count: int, of: str = "state"):
-    """Raise BadInput unless a function returned a tuple of `count` values, one for each state or control (`of`)."""
+def check_size(problem, field: str, values, count: int | None, of: str = "state"):
+    """Raise BadInput unless a function returned a tuple of `count` values, one for each state or control (`of`).
+
+    With None they may be any number but 0.
+    """
     if not isinstance(values, tuple):
         allowed = f"must be a tuple of {count}, one for each {of} (write the components of a matrix product)"
+        if count is None:
+            allowed = "must be a tuple (of one number: a comma behind it)"
         refuse(problem, False, f"what {field} returns", f"a {type(values).__name__}", allowed)
-    refuse(problem, len(values) == count, f"the number of what {field} returns", len(values), f"must be {count}")
+    fits = len(values) == count or (count is None and len(values) > 0)
+    refuse(problem, fits, f"the number of what {field} returns", len(values), f"must be {count or 'at least 1'}")
 
 
 def as_rows(problem, field: str, values) -> tuple:

@@ -54,8 +54,10 @@ class PhasedVectorEnv(BatchedEnv):
 
     - `episodic_return` (N,), with the true radii
     - `cost` (N,) and its parts `cost_state`, `cost_control`, `cost_terminal` (N,), or those of `Problem.parts`
-    - `hit` and `terminal_error` (N, phases): the distance to the target at each phase's end, in radii for an ellipse
+    - `hit` and `terminal_error` (N, phases): the distance to the target at each phase's end, in radii for an ellipse;
+      conditions count in it
     - with events `final_time` (N,) in s, and `arrived` (N,): whether every phase with an `end` ended by it
+    - with constraints `constraint_max` (N,): the largest value of any of them on the way
     - with scores `draw` (N, k)
 
     `observe_phase=False` shows tau and phi as 0, and `observe_velocity=False` the velocities. `observe_draw` adds the
@@ -105,6 +107,7 @@ class PhasedVectorEnv(BatchedEnv):
         self._step_in_phase = np.zeros(num_envs, dtype=np.int64)
         self._costs = {part: np.zeros(num_envs) for part in problem.parts}
         self._bonus = np.zeros(num_envs)
+        self._constraint_max = np.full(num_envs, -np.inf)
         self._arrived = np.ones(num_envs, dtype=bool)
         self._terminal_error = np.zeros((num_envs, len(problem.phases)))
 
@@ -147,11 +150,23 @@ class PhasedVectorEnv(BatchedEnv):
 
     @property
     def goals(self) -> list[float]:
-        """The radii and bonuses of all phases, and the bounds with their price."""
+        """Radii, bonuses, bounds and prices of the table, and its targets, conditions and constraints at one state."""
         problem = self.problem
         radii = [np.ravel(phase.radius) for phase in problem.phases]
         bonuses = [phase.bonus for phase in problem.phases]
-        return [*np.concatenate(radii), *bonuses, *problem.limits.ravel(), problem.bound_price]
+        prices = [problem.bound_price, problem.constraint_price]
+        x = tuple(problem.scale[:, None])
+        u = problem.as_control(problem.u_unit[:, None])
+        values = [*problem.constraints_at(x, u, problem.hidden(np.zeros((1, problem.scores))))]
+        for phase in problem.phases:
+            values += problem.misses(phase, x)
+        return [
+            *np.concatenate(radii),
+            *bonuses,
+            *problem.limits.ravel(),
+            *prices,
+            *np.ravel(np.hstack(values or [0.0])),
+        ]
 
     def _tabulate(self):
         """Make the tables by phase, of which `_phase` picks a row."""
@@ -195,6 +210,7 @@ class PhasedVectorEnv(BatchedEnv):
             part[mask] = 0.0
         for array in (self.time, self._bonus, self._terminal_error):
             array[mask] = 0.0
+        self._constraint_max[mask] = -np.inf
         self._arrived[mask] = True
         self._phase[mask] = 0
         self._step_in_phase[mask] = 0
@@ -234,18 +250,20 @@ class PhasedVectorEnv(BatchedEnv):
         length = np.full(self.num_envs, problem.dt)
         controls = problem.as_control(u)
         with np.errstate(over="ignore", invalid="ignore"):  # what diverges is refused below
-            self.x, running = self._fly(before, controls, phase, problem.dt)
-        running = np.zeros(self.num_envs) + running  # a table's `running` may be one number for all
+            self.x, *cost = self._fly(before, controls, phase, problem.dt)
+        cost = [np.zeros(self.num_envs) + value for value in cost]  # a table's `running` may be one number for all
         if self._has_events:
             has_ended = self._phase >= len(problem.phases)  # ended in an earlier step and not reset, so it stays
             self.x = tuple(np.where(has_ended, x, after) for x, after in zip(before, self.x))
         ends = self._step_in_phase + 1 == self._steps[phase]
         for k, event in self._moves:
-            met = self._end_by_event(k, event, before, controls, running, length)
+            met = self._end_by_event(k, event, before, controls, cost, length)
             self._arrived &= met | ~ends | (self._phase != k)
             ends = ends | met
         self._refuse_divergence()
-        costs = self._step_costs(before, u, running, length, phase)
+        running, excess, worst = cost
+        self._constraint_max = np.maximum(self._constraint_max, worst)
+        costs = self._step_costs(before, u, running, excess, length, phase)
         for part, cost in costs.items():
             self._costs[part] += cost
         rewards = -sum(costs.values(), np.zeros(self.num_envs))
@@ -272,19 +290,19 @@ class PhasedVectorEnv(BatchedEnv):
         )
 
     def _fly(self, x, u, phase, h):
-        """The states h seconds later, and the integral of `running` over them, by the phase of each environment."""
+        """What `flown` returns, by the phase of each environment."""
         problem, phases = self.problem, self.problem.phases
         if self._alike or (phase == phase[0]).all():
-            return problem.step(phases[phase[0]], x, u, self._parameters, h)
+            return flown(problem, phases[phase[0]], x, u, self._parameters, h)
         after = np.empty((problem.states, self.num_envs))
-        cost = np.zeros(self.num_envs)
+        cost, excess, worst = np.zeros((3, self.num_envs))
         for k in np.unique(phase):
             there = phase == k
             *_, fly = self._view(there, phases[k], x, u)
-            after[:, there], cost[there] = fly(h)
-        return tuple(after), cost
+            after[:, there], cost[there], excess[there], worst[there] = fly(h)
+        return tuple(after), cost, excess, worst
 
-    def _end_by_event(self, k, phase: Phase, before, u, running, length):
+    def _end_by_event(self, k, phase: Phase, before, u, cost, length):
         """The environments (N,) in phase k whose event falls through 0 in this step. Puts them where it does."""
         problem = self.problem
         event = problem.with_parameters(phase.end, self._parameters)
@@ -301,21 +319,20 @@ class PhasedVectorEnv(BatchedEnv):
         if len(there):
             _, _, of_event, fly = self._view(there, phase, before, u)
             h = falling_root(lambda h: of_event(fly(h)[0]), begin[there], end[there], until[there])
-            x, cost = fly(h)
-            for component, at_event in zip(self.x, x):
-                component[there] = at_event
-            running[there] = cost
+            x, *at_event = fly(h)
+            for component, value in zip([*self.x, *cost], [*x, *at_event]):
+                component[there] = value
             length[there] = h
         return met
 
     def _view(self, there, phase: Phase, before, u):
-        """For the environments `there`, a mask or indices: f(x), states at the begin, event(x), fly(h) as `step`."""
+        """For the environments `there`, a mask or indices: f(x), states at the begin, event(x), fly(h) by `flown`."""
         problem = self.problem
         x, p = (tuple(value[there] for value in values) for values in (before, self._parameters))
         u = tuple(value[there] for value in u) if isinstance(u, tuple) else u[there]
         f = problem.with_parameters(phase.f or problem.f, p)
         event = problem.with_parameters(phase.end, p)
-        return lambda x: f(x, u), x, event, lambda h: problem.step(phase, x, u, p, h)
+        return lambda x: f(x, u), x, event, lambda h: flown(problem, phase, x, u, p, h)
 
     def _dip(self, there, phase: Phase, before, u, begin, end):
         """The times (n,) in s at which the event is least in this step, and its values there.
@@ -342,7 +359,7 @@ class PhasedVectorEnv(BatchedEnv):
             value[turns] = event(fly(lowest[turns])[0])
         return lowest, value
 
-    def _step_costs(self, before, u, running, length, phase) -> dict:
+    def _step_costs(self, before, u, running, excess, length, phase) -> dict:
         """The parts of the cost that a step adds, (N,) each."""
         problem, costs = self.problem, {}
         if "state" in self._costs:
@@ -357,6 +374,8 @@ class PhasedVectorEnv(BatchedEnv):
             x = np.array(self.x)
             beyond = np.maximum(np.maximum(low - x, x - high), 0.0)
             costs["bounds"] = problem.bound_price * (beyond / problem.scale[:, None]).sum(axis=0) * length
+        if "constraints" in self._costs:
+            costs["constraints"] = problem.constraint_price * excess
         return costs
 
     def _end_phase(self, ending):
@@ -387,6 +406,8 @@ class PhasedVectorEnv(BatchedEnv):
         error = self._terminal_error.copy()
         hit = error <= [phase.circle_radius for phase in self.problem.phases]
         info = {"episodic_return": self._bonus - cost, "cost": cost, **parts, "hit": hit, "terminal_error": error}
+        if self.problem.constraints:
+            info["constraint_max"] = self._constraint_max.copy()
         if self._has_events:
             info["final_time"] = self.time.copy()
             info["arrived"] = self._arrived.copy()
@@ -403,6 +424,12 @@ class PhasedVectorEnv(BatchedEnv):
         from phased.animation import sheet_of
 
         return sheet_of(self.problem)
+
+
+def flown(problem: Problem, phase: Phase, x, u, p, h) -> tuple:
+    """(x, running, excess, worst) of a step of h seconds: `Problem.advance` and `Problem.violation`."""
+    x, running, points = problem.advance(phase, x, u, p, h)
+    return x, running, *problem.violation(points, u, p, h)
 
 
 def end_of_phase(problem: Problem, phase: Phase, x, p):

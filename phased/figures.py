@@ -23,7 +23,7 @@ def trajectories_figure(problem: Problem, arrays: dict, title: str) -> Figure:
 
     Of more states or controls each over time. `arrays` are those of eval.npz, here and below.
     """
-    if problem.states != 2 or problem.controls != 1 or problem.has_events:
+    if problem.states != 2 or problem.controls != 1 or problem.has_events or problem.constraints:
         return time_figure(problem, arrays, title)
     t = arrays["t"]
     position_name, velocity_name = problem.state_labels
@@ -55,11 +55,15 @@ def trajectories_figure(problem: Problem, arrays: dict, title: str) -> Figure:
 def time_figure(problem: Problem, arrays: dict, title: str) -> Figure:
     """Each state and each control of the first ten starts over time, with targets, bounds and the phases' ends."""
     labels = [*problem.state_labels, *problem.control_labels]
+    if problem.constraints:
+        labels.append("largest constraint")
     figure, panels = time_panels(labels, row_height=2.9, rest=1.0)
     for suffix, style in (("", POLICY), ("_reference", OPTIMUM)):
         for flight in flights_of(problem, arrays, suffix):
             plot_flight(panels, flight, style)
     mark_table(problem, panels)
+    if problem.constraints:
+        plot_constraints(problem, arrays, panels[len(labels) - 1])
     figure.suptitle(with_count(problem, arrays, title))
     handles = handles_of([POLICY, OPTIMUM])
     late = flights_out_of_time(arrays)
@@ -73,6 +77,19 @@ def time_figure(problem: Problem, arrays: dict, title: str) -> Figure:
     handles.append(Line2D([], [], **BOUNDARY, label="bound, or end of a phase"))
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
     return figure
+
+
+def plot_constraints(problem: Problem, arrays: dict, ax):
+    """Plot the largest constraint at each step's end, which must not be above 0."""
+    draw = arrays.get("draw", np.zeros((len(arrays["x"]), problem.scores)))[:SHOWN]
+    p = tuple(value[:, None] for value in problem.hidden(draw))
+    for suffix, style in (("", POLICY), ("_reference", OPTIMUM)):
+        x = arrays[f"x{suffix}"][:SHOWN, 1:]
+        u = arrays[f"u{suffix}"][:SHOWN].reshape(*x.shape[:2], problem.controls)
+        values = problem.constraints_at(tuple(np.moveaxis(x, -1, 0)), problem.as_control(np.moveaxis(u, -1, 0)), p)
+        largest = np.maximum.reduce(np.broadcast_arrays(*values))
+        ax.plot(np.broadcast_to(arrays["t"][1:], largest.shape).T, largest.T, **style)
+    ax.axhline(0.0, **{**BOUNDARY, "linestyle": "--"})
 
 
 def flights_out_of_time(arrays: dict) -> list[tuple]:

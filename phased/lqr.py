@@ -22,7 +22,7 @@ def linearise(problem: Problem, point=None, phase: Phase | None = None):
     changes = np.hstack([k * h * np.eye(n + m) for k in (-2, -1, 1, 2)])  # (n + m, 4 (n + m)), a change a column
     p = tuple(value[:1] for value in problem.hidden(np.zeros((1, problem.scores))))
     x = tuple(point[:, None] + changes[:n])
-    after, _ = problem.step(phase or problem.phases[0], x, problem.as_control(changes[n:]), p, problem.dt)
+    after, *_ = problem.advance(phase or problem.phases[0], x, problem.as_control(changes[n:]), p, problem.dt)
     far_below, below, above, far_above = np.split(np.array(after), 4, axis=1)
     AB = (8 * (above - below) - (far_above - far_below)) / (12 * h)
     return AB[:, :n], AB[:, n:]
@@ -48,7 +48,8 @@ def riccati(problem: Problem):
         target = problem.aim_of(phase)
         A, B = linearise(problem, target, phase)
         hidden = problem.hidden(np.zeros((1, problem.scores)))
-        rest, _ = problem.step(phase, tuple(target[:, None]), problem.as_control(np.zeros((m, 1))), hidden, problem.dt)
+        free = problem.as_control(np.zeros((m, 1)))
+        rest, *_ = problem.advance(phase, tuple(target[:, None]), free, hidden, problem.dt)
         drift = np.array(rest)[:, 0] - target
         p = p + P[end] @ (target - next_target)  # d is now the distance to this phase's target
         aimed = [value is not None for value in problem.targets_of(phase)]

@@ -10,6 +10,7 @@ import numpy as np
 from phased.problem import Problem
 
 PAPER_STARTS, PAPER_SAMPLES = 10, 100  # the paper reports the mean ratio of ten starts; we draw ten starts 100 times
+KEPT = 1e-6  # a constraint of up to this counts as kept
 NEAR_ORIGIN = 0.2  # for smaller |x0|, J* is so small that the loss J - J* says more than the ratio
 
 
@@ -22,6 +23,10 @@ def flight_metrics(problem: Problem, flight: dict, reference: dict) -> dict:
         for part in parts:
             metrics[f"{prefix}{part}_mean"] = float(result[part].mean())
         metrics[f"{prefix}hit_rate"] = float(result["hit"].all(axis=1).mean())
+        if problem.constraints:
+            metrics[f"{prefix}constraint_max"] = float(result["constraint_max"].max())
+            kept = result["constraint_max"] <= KEPT
+            metrics[f"{prefix}constraints_kept_rate"] = float(kept.mean())
         if problem.has_events:
             metrics[f"{prefix}final_time_mean"] = float(result["final_time"].mean())
             metrics[f"{prefix}arrival_rate"] = float(result["arrived"].mean())

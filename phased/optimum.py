@@ -52,13 +52,15 @@ class PhaseMesh(NamedTuple):
 
 
 def shooting(problem: Problem, phase: Phase, x, u, p, h, x_next):
-    """Defect of multiple shooting, x_{k+1} - step(x_k, u_k) with the environment's step, and the running cost."""
-    after, running = problem.step(phase, x, u, p, h)
-    return tuple(b - a for a, b in zip(after, x_next)), running
+    """Defect of multiple shooting, x_{k+1} - step(x_k, u_k) with the environment's step, the running cost, and the
+    states at which constraints hold.
+    """
+    after, running, points = problem.advance(phase, x, u, p, h)
+    return tuple(b - a for a, b in zip(after, x_next)), running, [*points[:-1], x_next]
 
 
 def hermite_simpson(problem: Problem, phase: Phase, x, u, p, h, x_next):
-    """Defect of direct collocation, and the running cost by Simpson's rule.
+    """Defect of direct collocation, the running cost by Simpson's rule, and the states at which constraints hold.
 
     A cubic through both ends of the step obeys x' = f(x, u) at mid-step, with a held control. Source: Hargraves and
     Paris (1987), in the compressed form of Betts, Practical Methods for Optimal Control, section 4.5.
@@ -70,9 +72,9 @@ def hermite_simpson(problem: Problem, phase: Phase, x, u, p, h, x_next):
     dx_mid = f(x_mid, u)
     defects = tuple(b - a - h / 6 * (da + 4 * dm + db) for a, b, da, dm, db in zip(x, x_next, dx, dx_mid, dx_next))
     if phase.running is None:
-        return defects, 0.0
+        return defects, 0.0, [x_mid, x_next]
     running = problem.with_parameters(phase.running, p)
-    return defects, h / 6 * (running(x, u) + 4 * running(x_mid, u) + running(x_next, u))
+    return defects, h / 6 * (running(x, u) + 4 * running(x_mid, u) + running(x_next, u)), [x_mid, x_next]
 
 
 def program(problem: Problem, mesh: PhaseMesh, defect: Callable, in_circles: bool):
@@ -82,7 +84,8 @@ def program(problem: Problem, mesh: PhaseMesh, defect: Callable, in_circles: boo
     - parameters: x_0 and the hidden parameters
     - cost: J of `phased/environment.py`, which is the paper's "J" as a sum over steps
     - constraints: the defects (n T of them, = 0); with `in_circles` the sum of (dx / r)^2 at each phase's end (<= 1);
-      for a phase with an event its value at the end (= 0) and before (>= 0); the square of a bounded norm
+      for a phase with an event its value at the end (= 0) and before (>= 0); the square of a bounded norm; the table's
+      own `constraints` (<= 0)
     """
     import casadi as ca
 
@@ -99,7 +102,7 @@ def program(problem: Problem, mesh: PhaseMesh, defect: Callable, in_circles: boo
     state = tuple(ca.vertsplit(x0))
     t = 0
     cost = 0
-    defects, circles, events, norms = [], [], [], []
+    defects, circles, events, norms, constraints = [], [], [], [], []
     for phase, count in zip(problem.phases, mesh.counts):
         dt = problem.dt / mesh.refine
         length = dt if phase.end is None else next(lengths)
@@ -113,13 +116,15 @@ def program(problem: Problem, mesh: PhaseMesh, defect: Callable, in_circles: boo
             cost += share * sum(q * (xi - target) ** 2 for q, xi, target in aims if target is not None)
             cost += share * sum(r * ui**2 for r, ui in zip(problem.control_weights(phase), controls))
             control = problem.as_control(controls)
-            gaps, running = defect(problem, phase, state, control, parameters, seconds, state_next)
+            gaps, running, points = defect(problem, phase, state, control, parameters, seconds, state_next)
             cost += running
             defects += gaps
             if phase.end is not None:
                 events.append((problem.with_parameters(phase.end, parameters)(state_next), is_last))
             if problem.u_norm is not None:
                 norms.append(sum(ui**2 for ui in controls))
+            for point in points:
+                constraints += problem.constraints_at(point, control, parameters)
             state = state_next
             t += 1
         d = problem.distances(phase, state)
@@ -127,13 +132,17 @@ def program(problem: Problem, mesh: PhaseMesh, defect: Callable, in_circles: boo
         if phase.terminal is not None:
             cost += problem.with_parameters(phase.terminal, parameters)(state)
         if phase.has_circle:
-            circles.append(sum((di / r) ** 2 for di, r in zip(d, problem.radii(phase))))
+            d = problem.misses(phase, state)
+            radii = phase.radius if isinstance(phase.radius, tuple) else (phase.radius,) * len(d)
+            circles.append(sum((di / r) ** 2 for di, r in zip(d, radii)))
     circles = circles if in_circles else []
-    g = ca.vertcat(*defects, *circles, *(value for value, _ in events), *norms)
+    g = ca.vertcat(*defects, *circles, *(value for value, _ in events), *norms, *constraints)
     least, greatest = problem.u_norm or (0.0, 0.0)
     low = [0.0] * len(defects) + [-np.inf] * len(circles) + [0.0] * len(events) + [least**2] * len(norms)
+    low += [-np.inf] * len(constraints)
     high = [0.0] * len(defects) + [1.0] * len(circles)
     high += [0.0 if is_last else np.inf for _, is_last in events] + [greatest**2] * len(norms)
+    high += [0.0] * len(constraints)
     symbols = {"x": ca.vertcat(ca.vec(u), ca.vec(x), h), "p": ca.vertcat(x0, p), "f": cost, "g": g}
     return symbols, np.array(low), np.array(high)
 
@@ -378,6 +387,7 @@ class Solution(NamedTuple):
     cost: float
     multipliers: np.ndarray  # of the circles' constraints
     bound_price: float  # the least `Problem.bound_price` with which crossing a bound does not pay
+    constraint_price: float  # the same of `Problem.constraint_price`
     status: str  # IPOPT's return status
     guesses: int = 1  # guesses that were tried
     guesses_agree: int = 1  # those that lead to this cost
@@ -428,7 +438,13 @@ def solve_on(problem: Problem, mesh: PhaseMesh, job: StartJob, sketches: list[Sk
     first = problem.controls * sum(mesh.counts)
     of_states = found["lam_x"].full()[first : first + begin, 0].reshape(-1, problem.states)
     bound_price = float((np.abs(of_states) * problem.scale).max() / problem.dt * mesh.refine)
-    return Solution(mesh, unknowns, float(found["f"]), multipliers, bound_price, status)
+    constraint_price = 0.0
+    if problem.constraints:  # the last rows
+        a_step = problem.substeps if job.defect is shooting else 2
+        count = len(problem.constraints_at(tuple(job.x0), problem.as_control(problem.u_centre), tuple(p)))
+        rows = found["lam_g"].full()[-count * a_step * sum(mesh.counts) :, 0]
+        constraint_price = float(np.abs(rows).max() / problem.dt * mesh.refine * a_step)
+    return Solution(mesh, unknowns, float(found["f"]), multipliers, bound_price, constraint_price, status)
 
 
 def held_steps(problem: Problem, job: StartJob, sketches: list[Sketch]) -> Solution:
@@ -558,7 +574,7 @@ def best_solution(job: StartJob) -> tuple[Solution, bool]:
     solved = [solution for solution in found if solution.succeeded]
     statuses = dict.fromkeys(solution.status for solution in found)
     # circles, bounds and events can be out of reach; without them every control has a trajectory
-    can_be_infeasible = job.in_circles or problem.bounds or problem.has_events
+    can_be_infeasible = job.in_circles or problem.bounds or problem.constraints or problem.has_events
     if not solved and not (can_be_infeasible and "Infeasible_Problem_Detected" in statuses):
         raise NoOptimum(f"{named(job)}: IPOPT stopped with {', '.join(statuses)}{why_it_stopped(statuses)}")
     if not solved:

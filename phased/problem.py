@@ -37,18 +37,20 @@ class Phase:
     - `running(x, u)`, integrated over the phase's time, and `terminal(x)` at its end
 
     Every function of a table takes x as a tuple of states. With hidden parameters it also takes their tuple p as its
-    last argument: f(x, u, p), running(x, u, p), terminal(x, p), end(x, p).
+    last argument: f(x, u, p), running(x, u, p), terminal(x, p), end(x, p). `conditions(x)` takes the states alone.
     """
 
     steps: int  # duration / dt; with `end` the longest duration
     target: tuple[float | None, ...] | None = None  # of each state, at the phase's end; None: free
-    radius: float | tuple[float, ...] = math.inf  # r_target; a tuple has an ellipse's axes, one for each aimed state
+    # r_target; a tuple has an ellipse's axes, one for each aimed state and then for each of the conditions
+    radius: float | tuple[float, ...] = math.inf
     R: float | tuple[float, ...] = 0.0  # weight of the control, or of each control
     Qf: float = 0.0  # weight of |d|^2 at the end
     bonus: float = 0.0  # terminal bonus B, paid within the radius
     Q: tuple[float, ...] | None = None  # weight of each state; None: 1, or 0 with `running` or `terminal`
     running: Callable | None = None  # cost for each second
     terminal: Callable | None = None  # cost at the end
+    conditions: Callable | None = None  # numbers that should be 0 at the end, counted in `radius` beside the target
     end: Callable | None = None  # the phase ends at the moment when end(x) falls through 0
     f: Callable | None = None  # dynamics of this phase; None: the problem's
 
@@ -60,7 +62,8 @@ class Phase:
     @property
     def weighted(self) -> bool:
         """Whether its cost is the paper's, by weights alone."""
-        return self.running is None and self.terminal is None and self.target is not None
+        functions = (self.running, self.terminal, self.conditions)
+        return self.target is not None and all(function is None for function in functions)
 
     @property
     def has_circle(self) -> bool:
@@ -73,7 +76,7 @@ class Phase:
         return 1.0 if isinstance(self.radius, tuple) else self.radius
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Problem:
     """A parameter table with n states and m controls, as many as `x_max` and `u_max` have numbers.
 
@@ -84,8 +87,12 @@ class Problem:
     An episode begins in the box `x0` +- `x0_max`. With `scores` k it first draws k standard scores z, clipped at +-3.
     `x0` may then be a function of z, a tuple of k arrays, and `parameters(z)` gives the hidden parameters p.
 
+    The dynamics are x' = `f`(x, u), or x_next = `step`(x, u), such as impulses and closed forms. With `step` a phase has
+    no event, and `running` is a sum over the steps.
+
     `bounds` are constraints in the optimum. The environment charges `bound_price` for each second at a distance of one
-    `x_scale` beyond them.
+    `x_scale` beyond them. `constraints`(x, u) are numbers that must not be above 0 at the end of any Runge-Kutta step.
+    The environment charges `constraint_price` for each second of an excess of 1. Both functions take p last.
 
     `single_optimum` promises that IPOPT ends in the same optimum from every guess, so the reference tries one guess
     (`guesses` of phased/optimum.py). Without it the reference is the best of several.
@@ -94,7 +101,8 @@ class Problem:
     """
 
     env_id: str
-    f: Callable  # x' = f(x, u), a tuple of n derivatives
+    f: Callable | None = None  # x' = f(x, u), a tuple of n derivatives
+    step: Callable | None = None  # x_next = step(x, u), a tuple of n states, instead of f
     u_max: float | tuple[float, ...]
     phases: tuple[Phase, ...]
     x_max: tuple[float, ...]  # a bound of every reachable |state|, for the observation's box; never a constraint
@@ -110,6 +118,8 @@ class Problem:
     parameters: Callable | None = None  # hidden parameters of z
     bounds: tuple[tuple[float | None, float | None] | None, ...] | None = None  # least and greatest of each state
     bound_price: float = 0.0
+    constraints: Callable | None = None  # a tuple of numbers of (x, u), each to be at most 0
+    constraint_price: float = 0.0
     x_scale: tuple[float, ...] | None = None  # a usual size of each state; None: 1
     velocities: tuple[int, ...] | None = None  # states that `observe_velocity=False` hides; None: the second of two
     substeps: int = 1  # Runge-Kutta steps in a step
@@ -224,7 +234,9 @@ class Problem:
         """The names of the cost's parts."""
         weights = ("state", "control") if any(phase.weighted or phase.R for phase in self.phases) else ()
         running = ("running",) if any(phase.running for phase in self.phases) else ()
-        return (*weights, *running, "terminal", *(("bounds",) if self.bounds else ()))
+        bounds = ("bounds",) if self.bounds else ()
+        constraints = ("constraints",) if self.constraints else ()
+        return (*weights, *running, "terminal", *bounds, *constraints)
 
     def targets_of(self, phase: Phase) -> tuple[float | None, ...]:
         """The target of each state, None for a free state."""
@@ -248,14 +260,14 @@ class Problem:
         """The signed distances to the target, of the states that have one."""
         return [xi - target for xi, target in zip(x, self.targets_of(phase)) if target is not None]
 
-    def radii(self, phase: Phase) -> tuple[float, ...]:
-        """The radii, of the states that have a target."""
-        count = sum(target is not None for target in self.targets_of(phase))
-        return phase.radius if isinstance(phase.radius, tuple) else (phase.radius,) * count
+    def misses(self, phase: Phase, x) -> list:
+        """What `radius` bounds: the signed distances to the target, and then the conditions."""
+        conditions = () if phase.conditions is None else phase.conditions(x)
+        return [*self.distances(phase, x), *conditions]
 
     def circle_distance(self, phase: Phase, x) -> np.ndarray:
-        """The distance (n,) of states x, a tuple of arrays, to a phase's target; in radii if `radius` is a tuple."""
-        d = self.distances(phase, x)
+        """The norm (n,) of `misses` at states x, a tuple of arrays; in radii if `radius` is a tuple."""
+        d = self.misses(phase, x)
         if not d:
             return np.zeros_like(x[0])
         if isinstance(phase.radius, tuple):
@@ -268,22 +280,47 @@ class Problem:
             return function
         return lambda *arguments: function(*arguments, p)
 
-    def step(self, phase: Phase, x, u, p, h) -> tuple:
-        """(x_next, cost): the states after h seconds, and the integral of `running` over them, 0 without it.
+    def advance(self, phase: Phase, x, u, p, h) -> tuple:
+        """(x_next, cost, points): the states after h seconds, the cost `running` until then, and what lies between.
 
-        x is a tuple of n arrays or symbols, u is one of them or a tuple, and p has the hidden parameters.
+        The cost is an integral, or 0 without `running`. `points` are the states after each Runge-Kutta step; the last
+        ones are x_next. x is a tuple of n arrays or symbols, u is one of them or a tuple, and p has the hidden
+        parameters.
         """
+        running = None if phase.running is None else self.with_parameters(phase.running, p)
+        if self.step is not None:
+            after = self.with_parameters(self.step, p)(x, u)
+            return after, 0.0 if running is None else running(x, u), [after]
         f = self.with_parameters(phase.f or self.f, p)
         h = h / self.substeps if self.substeps > 1 else h
-        if phase.running is None:
+        points = []
+        if running is None:
             for _ in range(self.substeps):
                 x = rk4(f, x, u, h)
-            return x, 0.0
-        running = self.with_parameters(phase.running, p)
+                points.append(x)
+            return x, 0.0, points
         y = (*x, 0.0)  # the cost is one more state
         for _ in range(self.substeps):
             y = rk4(lambda y, u: (*f(y[:-1], u), running(y[:-1], u)), y, u, h)
-        return y[:-1], y[-1]
+            points.append(y[:-1])
+        return y[:-1], y[-1], points
+
+    def constraints_at(self, x, u, p) -> tuple:
+        """The values of `constraints`, or () without it."""
+        return () if self.constraints is None else self.with_parameters(self.constraints, p)(x, u)
+
+    def violation(self, points, u, p, h) -> tuple:
+        """(excess, worst) of a step of h seconds: the integral of what exceeds 0, and the largest constraint.
+
+        `points` are those of `advance`. Without constraints they are 0 and -inf.
+        """
+        excess = 0.0
+        worst = -math.inf
+        for x in points if self.constraints else ():
+            for value in self.constraints_at(x, u, p):
+                excess = excess + np.maximum(value, 0.0) * h / len(points)
+                worst = np.maximum(worst, value)
+        return excess, worst
 
     def as_control(self, u):
         """Rows u (m, ...) as the table's functions take them: one row, or a tuple of rows."""

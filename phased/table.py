@@ -51,6 +51,9 @@ def hit_rows(problem: Problem, metrics: dict) -> list[tuple]:
     if "arrival_rate" in metrics:  # not in an older eval.json
         rate = f"{metrics['arrival_rate']:.1%}"
         rows.append(("flights that arrive", f"{metrics['reference_arrival_rate']:.1%}", rate, "-"))
+    if problem.constraints:
+        kept = (f"{metrics[f'{side}constraints_kept_rate']:.1%}" for side in ("reference_", ""))
+        rows.append(("flights that keep all constraints", *kept, "-"))
     if not any(phase.has_circle for phase in problem.phases):
         return rows
     label = "starts that hit every circle" if problem.waypoints else "starts that hit the target circle"
