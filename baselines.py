@@ -205,7 +205,7 @@ def reference_in_circles(env_id: str, x0, draw) -> dict:
     u, cost, feasible, _ = optimise(env_id, x0, in_circles=True, draw=draw)
     refuse_first(~feasible, env_id, x0, NO_FLIGHT)
     flight = fly_solution(env_id, x0, u, cost, draw)
-    refuse_first(~flight["hit"].all(axis=1), env_id, x0, "misses its circles")
+    refuse_missed(~flight["hit"].all(axis=1), env_id, x0, flight)
     return flight
 
 
@@ -214,6 +214,13 @@ def refuse_first(bad: np.ndarray, env_id: str, x0, what: str):
     if bad.any():
         start = int(np.argmax(bad))
         raise NoOptimum(f"start {start}, x0 = {x0[start].tolist()}, of {env_id} {what}")
+
+
+def refuse_missed(missed: np.ndarray, env_id: str, x0, flight: dict):
+    """Raise NoOptimum that says how far the first start of the mask (n,) ends from its targets, if there is one."""
+    if missed.any():
+        distances = flight["terminal_error"][np.argmax(missed)].tolist()
+        refuse_first(missed, env_id, x0, f"misses its circles: {distances}")
 
 
 def waypoint_reference(env_id: str, x0, draw) -> dict:
@@ -234,7 +241,7 @@ def waypoint_reference(env_id: str, x0, draw) -> dict:
     free = fly_solution(env_id, x0, u_free, cost_free, draw)
     best_u = np.where(feasible.reshape(-1, *[1] * (u.ndim - 1)), u, u_free)
     circled = fly_solution(env_id, x0, best_u, np.where(feasible, cost, cost_free), draw)
-    refuse_first(feasible & ~circled["hit"].all(axis=1), env_id, x0, "misses its circles")
+    refuse_missed(feasible & ~circled["hit"].all(axis=1), env_id, x0, circled)
     constrained = circled["episodic_return"] > free["episodic_return"]
     best = {key: free[key].copy() for key in free}
     for key, values in best.items():

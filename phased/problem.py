@@ -87,8 +87,8 @@ class Problem:
     An episode begins in the box `x0` +- `x0_max`. With `scores` k it first draws k standard scores z, clipped at +-3.
     `x0` may then be a function of z, a tuple of k arrays, and `parameters(z)` gives the hidden parameters p.
 
-    The dynamics are x' = `f`(x, u), or x_next = `step`(x, u), such as impulses and closed forms. With `step` a phase has
-    no event, and `running` is a sum over the steps.
+    The dynamics are x' = `f`(x, u), or x_next = `step`(x, u), such as impulses and closed forms. With `step` a phase
+    has no event, and `running` is a sum over the steps.
 
     `bounds` are constraints in the optimum. The environment charges `bound_price` for each second at a distance of one
     `x_scale` beyond them. `constraints`(x, u) are numbers that must not be above 0 at the end of any Runge-Kutta step.

@@ -78,11 +78,13 @@ def ratio_lines(problem: Problem, metrics: dict) -> list[str]:
         reason = "no start hit every circle" if metrics["hit_rate"] == 0 else "where ours hit, the optimum does not"
         return [f"  No cost ratio: {reason} (missing a circle is cheaper, not better)."]
     over = "the starts that hit every circle" if problem.circles_count else f"all {metrics['eval_starts']} starts"
+    of_flights = ""
     if "compared_starts" in metrics:
         both = "arrive and hit every circle" if problem.circles_count else "arrive"
         over = f"{metrics['compared_starts']} of {metrics['eval_starts']} starts, whose flights {both}"
+        of_flights = f" over {metrics['compared_starts']} of {metrics['eval_starts']} flights, which {both}"
     if problem.has_one_flight:
-        return [f"  Cost ratio ours / optimum: {metrics['ratio_of_sums']:.4f}"]
+        return [f"  Cost ratio ours / optimum{of_flights}: {metrics['ratio_of_sums']:.4f}"]
     lines = [f"  Cost ratio ours / optimum over {over}:"]
     lines.append(f"    mean {metrics['ratio_mean']:.4f}: the paper's statistic, a mean of ten starts, on average")
     draws = {key: metrics.get(f"ten_start_ratio_mean_{key}") for key in ("p05", "p50", "p95")}

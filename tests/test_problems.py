@@ -26,6 +26,7 @@ from common.integration import falling_root
 from common.tasks import task_of
 from drawing.evaluation import draw_figures
 from envs import PROBLEMS, Phase, Problem, fly
+from phased import optimum as optimum_module
 from phased.problem import flights_of_seed
 from problems.cart_pole import CART_POLE, cart_pole
 from problems.goddard import GODDARD
@@ -451,6 +452,98 @@ def test_equal_starts_are_solved_once(new_problem, monkeypatch):
     monkeypatch.setattr(baselines, "best_solution", lambda job: solved.append(job.index) or solve(job))
     flight = baselines.reference(env_id, np.tile([0.0, 1.0], (50, 1)))
     assert solved == [0] and len(flight["cost"]) == 50 and np.ptp(flight["cost"]) == 0
+
+
+# --- other people's tables, and optima that arrive --------------------------------------------------------------------
+
+
+def orbit_raising(env_id):
+    """Bryson and Ho, section 2.5: the greatest circular orbit after 193 days of constant thrust. u is its angle."""
+
+    def craft(x, u):
+        r, radial, w, m = x  # w = v sqrt(r) - 1 is 0 on a circle
+        v = (w + 1) / np.sqrt(r)
+        a = 0.1405 / m
+        dv = -radial * v / r + a * np.cos(u)
+        dw = dv * np.sqrt(r) + v * radial / (2 * np.sqrt(r))
+        return radial, v**2 / r - 1 / r**2 + a * np.sin(u), dw, -0.0749 + 0 * m
+
+    phase = Phase(40, (None, 0.0, 0.0, None), 0.001, bonus=20.0, terminal=lambda x: -10 * x[0])
+    table = {"u_min": 0.0, "x0": (1.0, 0.0, 0.0, 1.0), "x_scale": (0.3, 0.3, 0.2, 0.2)}
+    return Problem(env_id, craft, 2 * np.pi, (phase,), (10.0, 5.0, 5.0, 2.0), 3.32 / 40, 0.0, **table)
+
+
+@pytest.mark.slow
+def test_the_greatest_orbit_is_found_and_a_local_optimum_is_named(new_problem, monkeypatch, capsys):
+    """1.5252 is the published radius, with a circle of 0 and free steps. The constants alone lead to 1.456."""
+    problem = orbit_raising("Orbit-v0")
+    env_id = new_problem(problem)
+    x0, draw = flights_of_seed(problem, 0, 1)
+    job = optimum_module.StartJob(env_id, optimum_module.shooting, True, 0, x0[0], draw[0])
+    best, _ = optimum_module.best_solution(job)
+    assert 1.5252 < -best.cost / 10 < 1.5275
+    monkeypatch.setattr(optimum_module, "further_guesses", lambda *arguments: ())
+    local, _ = optimum_module.best_solution(job)
+    finer = optimum_module.refined(job, best, 4)
+    baselines.warn_of_better([job], [best], [finer])
+    assert capsys.readouterr().err == ""
+    baselines.warn_of_better([job], [local], [finer])
+    assert re.search("start 0 is a local one: it costs -14.5.*leads to -15.2.*`guess`", capsys.readouterr().err)
+
+
+@pytest.mark.slow
+def test_the_car_arrives_on_its_mountain(new_problem):
+    """It arrives with no speed to spare, so a solution of IPOPT may turn back by rounding before it is there."""
+    climb = lambda x, u: (x[1], 0.0015 * u - 0.0025 * np.cos(3 * x[0]))  # noqa: E731
+    phase = Phase(100, end=lambda x: 0.45 - x[0], running=lambda x, u: 0.1 * u**2)
+    table = {"x0": (-0.5, 0.0), "x_scale": (0.5, 0.05)}
+    problem = Problem("Mountain-v0", climb, 1.0, (phase,), (50.0, 1.0), 2.0, (0.1, 0.0), **table)
+    env_id = new_problem(problem)
+    x0, draw = flights_of_seed(problem, 0, 15)
+    flight = baselines.reference(env_id, x0[[0, 1, 14]], draw=draw[[0, 1, 14]])
+    assert flight["arrived"].all()
+    steps = np.isfinite(flight["u"]).sum(axis=1)
+    np.testing.assert_allclose(flight["x"][range(3), steps, 0], 0.45, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_the_flip_of_a_starship_ends_in_its_circle(new_problem):
+    """The cheapest of its solutions is 1e-8 cheaper than the others, and ends 3e-9 radii outside."""
+
+    def ship(x, u):
+        _, vx, _, vy, angle, rate = x
+        force = 2.21e6 * u[0]
+        turn = -25.0 * force * np.sin(u[1]) / (1e5 * 2500 / 12)
+        return vx, force * np.sin(u[1] + angle) / 1e5, vy, force * np.cos(u[1] + angle) / 1e5 - 9.8, rate, turn
+
+    effort = lambda x, u: (u[0] ** 2 + u[1] ** 2 + 2 * x[5] ** 2) / 0.04  # noqa: E731
+    phase = Phase(80, (0.0,) * 6, 0.1, bonus=20.0, running=effort)
+    gimbal = np.radians(20)
+    table = {"u_min": (0.4, -gimbal), "x0": (0.0, 0.0, 1000.0, -80.0, -np.pi / 2, 0.0)}
+    table["x_scale"] = (50.0, 20.0, 300.0, 50.0, 1.0, 0.5)
+    problem = Problem("Flip-v0", ship, (1.0, gimbal), (phase,), (5000.0,) * 6, 0.2, 0.0, **table)
+    x0, draw = flights_of_seed(problem, 0, 1)
+    flight = baselines.reference(new_problem(problem), x0, draw=draw)
+    assert flight["cost"][0] == pytest.approx(288.2746, abs=1e-4)
+    assert flight["hit"].all()
+
+
+def test_a_solution_outside_its_circle_by_rounding_is_aimed_anew(new_problem, monkeypatch):
+    """A push from rest to 1 in a second with least effort stops at the edge of its circle."""
+    phase = Phase(10, (1.0, 0.0), 0.1, bonus=99.0, running=lambda x, u: u**2)
+    problem = Problem("Edge-v0", lambda x, u: (x[1], u), 20.0, (phase,), (99.0, 99.0), 0.1, 0.0)
+    job = optimum_module.StartJob(new_problem(problem), optimum_module.shooting, True, 0, np.zeros(2), np.zeros(0))
+    best, _ = optimum_module.best_solution(job)
+    sketches = optimum_module.sketches_of(problem, best.mesh, job.x0, best.unknowns)
+    outside = optimum_module.solve_on(problem, best.mesh, job, sketches, -1e-6)
+    assert outside.cost < best.cost
+    inside = optimum_module.that_arrives(problem, job, [outside])
+    assert inside.cost == pytest.approx(best.cost, rel=1e-7)
+    assert optimum_module.that_arrives(problem, job, [outside._replace(cost=best.cost), best]) is best
+    monkeypatch.setattr(optimum_module, "AIMS", ())
+    message = r"^the best flight from start 0, .* of Edge-v0 ends phase 1 at a distance of 0.1000001.* circle of 0.1"
+    with pytest.raises(NoOptimum, match=message):
+        optimum_module.that_arrives(problem, job, [outside])
 
 
 # --- slips ------------------------------------------------------------------------------------------------------------
