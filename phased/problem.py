@@ -50,9 +50,9 @@ class Phase:
     Q: tuple[float, ...] | None = None  # weight of each state; None: 1, or 0 with `running` or `terminal`
     running: Callable | None = None  # cost for each second
     terminal: Callable | None = None  # cost at the end
-    conditions: Callable | None = None  # numbers that should be 0 at the end, counted in `radius` beside the target
     end: Callable | None = None  # the phase ends at the moment when end(x) falls through 0
     f: Callable | None = None  # dynamics of this phase; None: the problem's
+    conditions: Callable | None = None  # numbers that should be 0 at the end, counted in `radius` beside the target
 
     def __post_init__(self):
         lists_to_tuples(self)
@@ -76,7 +76,7 @@ class Phase:
         return 1.0 if isinstance(self.radius, tuple) else self.radius
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Problem:
     """A parameter table with n states and m controls, as many as `x_max` and `u_max` have numbers.
 
@@ -102,10 +102,10 @@ class Problem:
 
     env_id: str
     f: Callable | None = None  # x' = f(x, u), a tuple of n derivatives
-    step: Callable | None = None  # x_next = step(x, u), a tuple of n states, instead of f
-    u_max: float | tuple[float, ...]
-    phases: tuple[Phase, ...]
-    x_max: tuple[float, ...]  # a bound of every reachable |state|, for the observation's box; never a constraint
+    # these three have to be given, too; the checks refuse the defaults, which stand here because f may be left out
+    u_max: float | tuple[float, ...] = math.nan
+    phases: tuple[Phase, ...] = ()
+    x_max: tuple[float, ...] = ()  # a bound of every reachable |state|, for the observation's box; never a constraint
     dt: float = 0.1  # s, a step, for which a control is held
     x0_max: float | tuple[float, ...] = 1.0  # the paper's "state bounds", by our reading the box of initial states
     single_optimum: bool = False
@@ -118,13 +118,14 @@ class Problem:
     parameters: Callable | None = None  # hidden parameters of z
     bounds: tuple[tuple[float | None, float | None] | None, ...] | None = None  # least and greatest of each state
     bound_price: float = 0.0
-    constraints: Callable | None = None  # a tuple of numbers of (x, u), each to be at most 0
-    constraint_price: float = 0.0
     x_scale: tuple[float, ...] | None = None  # a usual size of each state; None: 1
     velocities: tuple[int, ...] | None = None  # states that `observe_velocity=False` hides; None: the second of two
     substeps: int = 1  # Runge-Kutta steps in a step
     x_names: tuple[str, ...] | None = None
     u_names: tuple[str, ...] | None = None
+    step: Callable | None = None  # x_next = step(x, u), a tuple of n states, instead of f
+    constraints: Callable | None = None  # a tuple of numbers of (x, u), each to be at most 0
+    constraint_price: float = 0.0
 
     def __post_init__(self):
         lists_to_tuples(self)
