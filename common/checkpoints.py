@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType, UnionType
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 import safetensors
@@ -51,7 +51,7 @@ def read_checkpoint(
         # this check comes first, because another script's file has other arguments, too
         if env_ids and isinstance(env_id, str) and env_id not in env_ids:
             raise BadInput(f"{flag}{path}: is of {env_id}; this script takes {', '.join(env_ids)}")
-        allowed: dict[str, tuple[type, ...]] = {name: get_args(kind) or (kind,) for name, kind in expected.items()}
+        allowed: dict[str, Any] = {name: get_args(kind) or (kind,) for name, kind in expected.items()}
         wrong = [name for name, kinds in allowed.items() if type(args[name]) not in kinds]
         metadata.setdefault("training_seconds", metadata["wall_seconds"])  # an older file has only this time
         counters = {name: kind(metadata[name]) for name, kind in COUNTERS.items()}

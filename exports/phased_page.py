@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from common.errors import refuse_unless
@@ -19,7 +21,7 @@ def page(task: PhasedTask, metrics: dict, arrays: dict, checkpoint: dict, launch
     Raises BadInput if the problem is not written in JavaScript, or if the policy has other features.
     """
     problem = task.problem
-    f = problem.step or problem.f
+    f: Any = problem.f or problem.step
     known = f.__module__ == "envs" and f.__name__ in DYNAMICS
     allowed = f"must be one of envs.py's {', '.join(DYNAMICS)}, which are written in JavaScript, too"
     refuse_unless(known, f"the dynamics of {problem.env_id}", f"{f.__module__}.{f.__name__}", allowed)
@@ -53,8 +55,9 @@ def is_plain(problem: Problem) -> bool:
 def constants(problem: Problem) -> dict:
     """The table's constants."""
     low, high = problem.u_box[:, 0].tolist()
+    f: Any = problem.f
     return {
-        "dynamics": problem.f.__name__,
+        "dynamics": f.__name__,
         "dt": problem.dt,
         "steps": problem.steps,
         "u_low": low,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -208,7 +209,7 @@ def try_functions(problem):
         as_rows(problem, "guess", controls if isinstance(problem.u_max, tuple) else (controls,))
     for k, phase in enumerate(problem.phases, start=1):
         name = "step" if problem.f is None else "f" if phase.f is None else f"f of phase {k}"
-        dynamics = problem.step or phase.f or problem.f
+        dynamics: Any = problem.step or phase.f or problem.f
         check_tuple(problem, name, dynamics, (x, u), p, problem.states)
         if phase.conditions is not None:
             field = f"conditions of phase {k}"
