@@ -338,7 +338,7 @@ def compare_finer(env_id: str, x0, flight: dict, draw) -> dict:
     jobs = [StartJob(env_id, shooting, problem.circles_count, k, x0[k], draw[k]) for k in some]
     best = [best_solution(job)[0] for job in jobs]
     doubtful = min(best, key=lambda solution: solution.guesses_agree)
-    numbers = {"guesses": doubtful.guesses, "guesses_agree": doubtful.guesses_agree}
+    numbers: dict[str, float] = {"guesses": doubtful.guesses, "guesses_agree": doubtful.guesses_agree}
     if problem.bounds:
         needed = max(solution.bound_price for solution in best)
         numbers["bound_price_needed"] = needed if needed > 1e-6 else 0.0
