@@ -342,7 +342,7 @@ def compare_finer(env_id: str, x0, flight: dict, draw) -> dict:
     jobs = [StartJob(env_id, shooting, problem.circles_count, k, x0[k], draw[k]) for k in some]
     best = [best_solution(job)[0] for job in jobs]
     doubtful = min(best, key=lambda solution: solution.guesses_agree)
-    numbers = {"guesses": doubtful.guesses, "guesses_agree": doubtful.guesses_agree}
+    numbers: dict[str, float] = {"guesses": doubtful.guesses, "guesses_agree": doubtful.guesses_agree}
     for name, limits in (("bound_price", problem.bounds), ("constraint_price", problem.constraints)):
         if not limits:
             continue

@@ -398,9 +398,10 @@ class Solution(NamedTuple):
 
 
 def aimed(problem: Problem, mesh: PhaseMesh, job: StartJob, sketches: list[Sketch], aim: float) -> dict:
-    """The arguments of `solver` with circles that are smaller by the share `aim`, and with ends past their events.
+    """The arguments of `solver` with smaller circles, and with ends past their events.
 
-    An event's value is at least the share `aim` of its largest value on the way until the end, where it is -`aim`.
+    Circles are smaller by the share `aim`, or its root if there are events. An event's value is at least the share
+    `aim` of its largest value on the way until the end, where it is -`aim`.
     """
     _, arguments = solver(problem, mesh, job.defect, job.in_circles)
     low = arguments["lbg"].copy()
@@ -408,7 +409,9 @@ def aimed(problem: Problem, mesh: PhaseMesh, job: StartJob, sketches: list[Sketc
     begin = problem.states * sum(mesh.counts)
     if job.in_circles:
         circles = sum(phase.has_circle for phase in problem.phases)
-        high[begin : begin + circles] = (1 - aim) ** 2
+        # an event that is grazed comes sooner by the root of the aim, and the state there differs as much
+        smaller = np.sqrt(aim) if problem.has_events else aim
+        high[begin : begin + circles] = (1 - smaller) ** 2
         begin += circles
     hidden = tuple(float(value[0]) for value in problem.hidden(job.draw[None]))
     for phase, count, sketch in zip(problem.phases, mesh.counts, sketches):
