@@ -499,3 +499,13 @@ def test_bad_command_ends_with_an_error_status(tmp_path):
     ended = run(tmp_path, "van-der-pol", "--starts", "0", "--json", "a.json")
     assert ended.returncode == 1 and ended.stderr.count("\n") == 1 and ended.stdout == ""
     assert not list(tmp_path.iterdir())
+
+
+def test_a_table_of_this_session_is_solved_here(monkeypatch):
+    """No other process would know it, although its id may be asked to be shared out."""
+    table = replace(VAN_DER_POL, env_id="OfThisSession-v0")
+    monkeypatch.setitem(PROBLEMS, table.env_id, table)
+    x0 = starts(4)
+    shared = optimise(table.env_id, x0, processes=2)
+    for mine, known in zip(shared, optimise("VanDerPol-v0", x0, processes=1)):
+        np.testing.assert_array_equal(mine, known)

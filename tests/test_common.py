@@ -116,7 +116,7 @@ def children():
 
 def test_a_lost_worker_is_one_line():
     with Workers(2) as workers:
-        workers.map(about, [1, 2])
+        workers.map(abs, [1, 2])
         threading.Timer(0.2, lambda: os.kill(children()[0], signal.SIGKILL)).start()
         with pytest.raises(NoOptimum, match="^a process that solves is lost"):
             workers.map(time.sleep, [60, 60])
@@ -125,7 +125,7 @@ def test_a_lost_worker_is_one_line():
 def test_an_error_ends_the_workers_at_once():
     began = time.monotonic()
     with pytest.raises(ZeroDivisionError), Workers(2) as workers:
-        workers.map(about, [1, 2])
+        workers.map(abs, [1, 2])
         workers.pool.submit(time.sleep, 60)
         raise ZeroDivisionError
     assert time.monotonic() - began < 30 and not children()
