@@ -188,7 +188,7 @@ class BatchedEnv(VectorEnv):
         self.hand_over(options.pop("training", {} if mask.all() else before))
         try:
             if seeds is None:
-                super().reset(seed=seed)
+                super().reset(seed=seed)  # pyright: ignore[reportArgumentType] - one number or None
                 self._restart(mask, options)
             else:
                 self._restart_each(mask, options, seeds)

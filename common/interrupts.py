@@ -63,7 +63,7 @@ def say(line: str):
     try:
         print(line, flush=True)
     except OSError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.__stdout__.fileno())  # else Python fails when it ends
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # else Python fails when it ends
 
 
 def leave():
