@@ -19,8 +19,8 @@ that its evaluations fly.
 
 from __future__ import annotations
 
+import common.interrupts  # noqa: F401 # isort: skip - first, so that Ctrl-C in the other imports prints no traceback
 import json
-import os
 import sys
 import time
 from collections.abc import Callable
@@ -32,10 +32,11 @@ import numpy as np
 from common.command_line import OneLineParser, integer, output_file, typed_command
 from common.errors import BadInput, NoOptimum
 from common.files import replacing, write_npz
+from common.interrupts import catch_signals, leave
 from common.ipopt import limit
 from common.tasks import env_ids, task_of
-from common.workers import Workers
-from envs import DOUBLE_INTEGRATOR
+from common.workers import Workers, usable_cores
+from envs import DOUBLE_INTEGRATOR, TABLES_OF_FILES
 from phased.environment import fly
 from phased.lqr import linearise, lqr, lqr_policy, riccati
 from phased.optimum import StartJob, agrees, best_solution, coarse, controls_of, hermite_simpson, refined, shooting
@@ -126,7 +127,9 @@ def optimise(
     rank = np.argsort(order)
     jobs = [StartJob(env_id, defect, in_circles, int(k), x0[k], draw[k]) for k in first[order]]
     if processes is None:
-        processes = max(1, min(os.cpu_count() or 1, len(jobs) // STARTS_PER_PROCESS))
+        processes = max(1, min(usable_cores(), len(jobs) // STARTS_PER_PROCESS))
+    if problem is not TABLES_OF_FILES.get(env_id):
+        processes = 1  # another process would not know the table
     with Workers(processes) as workers:
         solutions = workers.map(_solve_start, jobs)
     u, cost, feasible, multipliers = (list(column) for column in zip(*solutions))
@@ -476,6 +479,7 @@ def parse_args(argv=None):
 
 def main() -> None:
     """Run the sub-command; what can go wrong in it ends in one line."""
+    catch_signals()
     args = parse_args()
     limit["seconds"] = args.solve_seconds
     try:
@@ -483,7 +487,7 @@ def main() -> None:
     except (BadInput, ImportError, OSError, RuntimeError) as error:
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:
-        sys.exit(130)
+        leave()
 
 
 if __name__ == "__main__":

@@ -214,6 +214,7 @@ register_lander("MarsLanding-v0", MARS)
 register_lander("PoweredDescent-v0", POWERED_DESCENT)
 import_files_of("problems")
 import_files_of("vehicles")
+TABLES_OF_FILES = dict(PROBLEMS)  # of this file and of problems/: what every process knows that imports this module
 WITHOUT_OPTIMUM = RegisteredIds(PROBLEMS, ROCKETS, LANDERS)
 add_family(PROBLEMS, "baselines:problem_task")
 add_family(ROCKETS, "rocket.task:RocketTask.of")

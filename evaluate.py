@@ -15,6 +15,7 @@ is taken away. Reading order: evaluation, results folders, command line.
 
 from __future__ import annotations
 
+import common.interrupts  # noqa: F401 # isort: skip - first, so that Ctrl-C in the other imports prints no traceback
 import sys
 import tempfile
 from pathlib import Path
@@ -28,6 +29,7 @@ from common.curves import evaluated, read_csv, read_curve, write_csv
 from common.errors import BadInput
 from common.evaluations import first_edited, read_evaluation, read_json, read_metrics, refuse_another_policy
 from common.files import read_npz, write_bytes, write_npz
+from common.interrupts import catch_signals, leave
 from common.policies import evaluate_by_script, script_of
 from common.schedule import Schedule
 from common.tasks import task_of
@@ -397,6 +399,7 @@ def parse_args(argv=None):
 
 def main():
     """Run the sub-command. An error in it ends in one line."""
+    catch_signals()
     args = parse_args()
     try:
         if args.command in SHOWING and (args.folder / "eval.json").exists():
@@ -405,7 +408,8 @@ def main():
     except (ImportError, OSError, RuntimeError, ValueError) as error:
         sys.exit(f"evaluate.py: {error}")
     except KeyboardInterrupt:
-        sys.exit(130)
+        print("evaluate.py: stopped", file=sys.stderr)
+        leave()
 
 
 if __name__ == "__main__":

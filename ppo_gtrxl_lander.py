@@ -18,6 +18,7 @@ The paper names landing and does not fly it. This problem is from Gaudet, Linare
 
 from __future__ import annotations
 
+import common.interrupts  # noqa: F401 # isort: skip - first, so that Ctrl-C in the other imports prints no traceback
 import math
 import sys
 from dataclasses import dataclass

@@ -22,6 +22,7 @@ rocket/rewards.py. Here R_trajectory has no weight. R_guidance counts only with 
 
 from __future__ import annotations
 
+import common.interrupts  # noqa: F401 # isort: skip - first, so that Ctrl-C in the other imports prints no traceback
 import math
 import sys
 from dataclasses import dataclass

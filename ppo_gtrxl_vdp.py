@@ -20,6 +20,7 @@ Eq. (19). The problems' tables are in envs.py, cost, reward and observation in p
 
 from __future__ import annotations
 
+import common.interrupts  # noqa: F401 # isort: skip - first, so that Ctrl-C in the other imports prints no traceback
 import math
 import sys
 from dataclasses import dataclass

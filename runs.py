@@ -17,7 +17,6 @@ import io
 import json
 import math
 import os
-import signal
 import sys
 import time
 import zipfile
@@ -43,6 +42,7 @@ from common.errors import BadInput, NoOptimum, refuse_unless
 from common.evaluations import write_evaluation
 from common.fingerprint import KEY, changes, fingerprint
 from common.flags import Policy, Range, Words, facts, plain_args
+from common.interrupts import catch_signals, leave, say, uninterrupted
 from common.schedule import Schedule
 from common.tasks import Task, task_of
 
@@ -363,22 +363,16 @@ def largest_group(most, shares):
 def run_script(main):
     """Run a script's `main(argv)`.
 
-    Ctrl-C ends it with exit status 130, SIGTERM with 143, and bad input with one line and 1.
+    Ctrl-C ends it with exit status 130, SIGTERM with 143, the end of its terminal with 129, and bad input with one line
+    and 1.
     """
-    status = [128 + signal.SIGINT]
-
-    def interrupt(signum, _):
-        status[0] = 128 + signum
-        raise KeyboardInterrupt
-
-    for signum in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(signum, interrupt)
+    catch_signals()
     try:
         main(sys.argv[1:])
     except (BadInput, NoOptimum, ImportError, OSError) as error:
         fail(error)
     except KeyboardInterrupt:
-        sys.exit(status[0])
+        leave()
 
 
 def prepare_torch(args):
@@ -564,6 +558,11 @@ class Run:
             self.task.optimum(seed, self.flights(seed), **self.env_options)
 
     def __exit__(self, kind, error, traceback):
+        with uninterrupted():
+            self.close(error)
+
+    def close(self, error):
+        """Save what was learned until `error`, and say how to go on. Without an error it is saved already."""
         if self.writer:
             with files.naming(self.folder):
                 self.writer.flush()
@@ -579,10 +578,17 @@ class Run:
         if isinstance(error, FloatingPointError):
             kept = f"; the last good checkpoint is {self.folder}/training_state.pt" if saved else ""
             fail(f"update {updates + 1}: {error}, must be finite{kept}")
+        self.say_stopped()
+
+    def say_stopped(self):
+        """Print after which update a signal has stopped the run, and the command that goes on."""
+        if self.rank > 0:
+            return
         script = f"{type(self.args)().exp_name}.py"
-        kept = f"go on with: {typed_command(script, '--resume', self.folder)}" if saved else "nothing saved"
-        if self.rank == 0:
-            print(f"stopped after update {updates}; {kept}")
+        kept = "nothing saved"
+        if self.args.save_model:
+            kept = f"go on with: {typed_command(script, '--resume', self.folder)}"
+        say(f"stopped after update {self.state['progress']['total_updates']}; {kept}")
 
     def current_state(self):
         """A copy of all that a resume needs. An environment that cannot be told by what it does has no fingerprint."""
@@ -660,7 +666,16 @@ class Run:
         return self.args.eval_starts
 
     def finish(self):
-        """Fly the reported starts, write the evaluation and print the table."""
+        """Fly the reported starts, write the evaluation and print the table. A signal leaves the trained policy."""
+        try:
+            self.report()
+        except KeyboardInterrupt:
+            if not self.args.eval_only:
+                self.say_stopped()
+            raise
+
+    def report(self):
+        """What `finish` does without a signal."""
         args = self.args
         if self.rank > 0:
             return

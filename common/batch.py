@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -12,13 +12,14 @@ import numpy as np
 from gymnasium.envs.registration import load_env_creator
 from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box
+from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from common.errors import BadInput, is_finite, refuse_unless
+from common.errors import BadInput, BadOption, is_finite, refuse_unless
 
 RENDERED = {"render_modes": ["rgb_array"], "render_fps": 15}
-AUTORESET_MODES = (AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP)
+AUTORESET_MODES = (AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED)
 
 
 def numeric(default, low: float = 0.0, high: float = np.inf):
@@ -76,7 +77,9 @@ class BatchedEnv(VectorEnv):
     With `autoreset_mode` "SameStep", the default, the step in which an episode ends returns the next episode's first
     observation. The ended episode's last values are `final_obs` and `final_info`. Some of Gymnasium's vector wrappers
     expect "NextStep". Then that step returns the episode's last observation, and its last values in the info. The next
-    step ignores that environment's action and returns the next episode's first observation, with reward 0.
+    step ignores that environment's action and returns the next episode's first observation, with reward 0. With
+    "Disabled" the user starts ended episodes by `reset(options={"reset_mask": mask})`, mask (N,) of bool, which leaves
+    the other environments as they are. All modes take a mask.
     https://farama.org/Vector-Autoreset-Mode
 
     A problem gives the spaces, `episode_steps` (of the longest episode) and three methods:
@@ -131,10 +134,10 @@ class BatchedEnv(VectorEnv):
         if num_envs < 1:
             raise ValueError(f"num_envs is {num_envs}; it must be at least 1")
         if autoreset_mode not in [*AUTORESET_MODES, *(mode.value for mode in AUTORESET_MODES)]:
-            allowed = " or ".join(repr(mode.value) for mode in AUTORESET_MODES)
-            raise ValueError(f"autoreset_mode is {autoreset_mode!r}; it must be {allowed}")
+            allowed = ", ".join(repr(mode.value) for mode in AUTORESET_MODES)
+            raise ValueError(f"autoreset_mode is {autoreset_mode!r}; it must be one of {allowed}")
         self.metadata = {**self.metadata, "autoreset_mode": AutoresetMode(autoreset_mode)}
-        self._waiting = np.zeros(num_envs, dtype=bool)  # with NextStep: the episodes that ended in the last step
+        self._waiting = np.zeros(num_envs, dtype=bool)  # but with SameStep: the episodes that have ended
         if render_mode not in (None, *self.metadata["render_modes"]):
             allowed = ", ".join(["None", *self.metadata["render_modes"]])
             wrong = ValueError if self.metadata["render_modes"] else TypeError  # Stable-Baselines3 then asks for none
@@ -175,20 +178,59 @@ class BatchedEnv(VectorEnv):
         """Numbers of the table that a few flights need not show, such as the radius of a circle that they miss."""
         return []
 
-    def reset(self, *, seed: int | None = None, options: dict | None = None):
-        """Start every environment anew. Returns (N, obs) float64 and an empty info."""
-        super().reset(seed=seed)
+    def reset(self, *, seed: int | Sequence[int | None] | None = None, options: dict | None = None):
+        """Start all environments anew, or those of `options["reset_mask"]`. Returns (N, obs) float64 and an empty info.
+
+        With one seed for each environment, environment k starts where a single environment starts with seed k. Later
+        starts come from the first seed's stream.
+        """
         options = dict(options or {})
+        mask = self._mask_of(options.pop("reset_mask", None))
+        seeds = self._seeds_of(seed)
         before = vars(self.training)
-        self.hand_over(options.pop("training", {}))
+        self.hand_over(options.pop("training", {} if mask.all() else before))
         try:
-            self._restart(np.ones(self.num_envs, dtype=bool), options)
+            if seeds is None:
+                super().reset(seed=seed)  # pyright: ignore[reportArgumentType] - one number or None
+                self._restart(mask, options)
+            else:
+                self._restart_each(mask, options, seeds)
         except BadInput:
             self.hand_over(before)
             raise
-        self._waiting[:] = False
+        self._waiting[mask] = False
         self._was_reset = True
         return self._observe(), {}
+
+    def _mask_of(self, given) -> np.ndarray:
+        """The environments (N,) that a reset starts anew, by its option `reset_mask`."""
+        if given is None:
+            return np.ones(self.num_envs, dtype=bool)
+        fits = isinstance(given, np.ndarray) and given.dtype == bool and given.shape == (self.num_envs,)
+        allowed = f"must be an array of bool, of shape ({self.num_envs},), with a True"
+        refuse_unless(fits and given.any(), "options['reset_mask']", repr(given), allowed)
+        if not (self._was_reset or given.all()):
+            raise ResetNeeded("some episodes have never begun: call reset() without a reset_mask first")
+        return given.copy()
+
+    def _seeds_of(self, given) -> list[int | None] | None:
+        """One seed for each environment, or None if `given` is one seed for all of them."""
+        if not isinstance(given, list | tuple | np.ndarray):
+            return None
+        seeds = [int(seed) if isinstance(seed, np.integer) else seed for seed in given]
+        are_seeds = all(seed is None or (isinstance(seed, int) and seed >= 0) for seed in seeds)
+        fits = len(seeds) == self.num_envs and are_seeds
+        refuse_unless(fits, "seed", repr(given), f"must be one whole number, or {self.num_envs} of them")
+        return seeds
+
+    def _restart_each(self, mask, options, seeds):
+        """Start each environment in `mask` by its own seed. One without a seed starts by the batch's stream."""
+        stream = self.np_random
+        streams = [stream if seed is None else seeding.np_random(seed)[0] for seed in seeds]
+        for k in np.flatnonzero(mask):
+            self._np_random = streams[k]
+            self._restart(np.arange(self.num_envs) == k, options)
+        self._np_random = streams[0]
 
     def refuse_options(self, options: dict, known: list[str], none: str = "there are none"):
         """Raise BadInput if a reset has an option that is not among these. `none` says why none is known."""
@@ -224,9 +266,12 @@ class BatchedEnv(VectorEnv):
         self.training = kind(**training)
 
     def step(self, actions):
-        """Fly one step. Ended episodes restart in this step, or in the next one with `autoreset_mode` "NextStep"."""
-        if self.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP:
+        """Fly one step. Ended episodes restart in this step, unless `autoreset_mode` is "NextStep" or "Disabled"."""
+        mode = self.metadata["autoreset_mode"]
+        if mode is AutoresetMode.NEXT_STEP:
             return self._step_and_wait(actions)
+        if mode is AutoresetMode.DISABLED:
+            return self._step_and_stay(actions)
         obs, rewards, terminated, final = self.advance(actions)
         info = {}
         if terminated.any():
@@ -248,6 +293,18 @@ class BatchedEnv(VectorEnv):
             obs = self.restart(begins)
             rewards = np.where(begins, 0.0, rewards)
         terminated = terminated & ~begins
+        return self._waiting_for(terminated, obs, rewards, final)
+
+    def _step_and_stay(self, actions):
+        """`step` without autoreset."""
+        if self._waiting.any():
+            ended = np.flatnonzero(self._waiting).tolist()
+            raise ResetNeeded(f"the episodes of envs {ended} have ended: call reset(options={{'reset_mask': mask}})")
+        obs, rewards, terminated, final = self.advance(actions)
+        return self._waiting_for(terminated, obs, rewards, final)
+
+    def _waiting_for(self, terminated, obs, rewards, final):
+        """What a step returns after which the `terminated` episodes wait for a start."""
         self._waiting = terminated
         info = {}
         if terminated.any():
@@ -384,12 +441,16 @@ class SingleEnv(gym.Env):
 
 
 def check_options(environment: type, options: dict, *others: str):
-    """Raise BadInput for an option that is neither an argument of an environment's constructor nor in `others`."""
+    """Raise BadOption for an option that is neither an argument of an environment's constructor nor in `others`.
+
+    TorchRL looks for Python's own words in it.
+    """
     given_otherwise = ("num_envs", "problem", "mission", "lander")
     taken = [name for name in inspect.signature(environment).parameters if name not in given_otherwise]
     allowed = [*taken, *others]
     for name, value in options.items():
-        refuse_unless(name in allowed, f"the option {name}", repr(value), f"must be one of {', '.join(allowed)}")
+        if name not in allowed:
+            raise BadOption(f"unexpected keyword argument {name!r}, {value!r}; it must be one of {', '.join(allowed)}")
 
 
 def refuse_autoreset(options: dict):

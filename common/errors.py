@@ -11,6 +11,10 @@ class BadInput(ValueError):
     """A value or file of a user that cannot be used. Its message is the one line that is shown."""
 
 
+class BadOption(BadInput, TypeError):
+    """An option that an environment does not take. TorchRL tries options, and goes on without one at a TypeError."""
+
+
 class NoOptimum(RuntimeError):
     """A reference that was not found, or that does not fly as it was solved. Its message is one line."""
 

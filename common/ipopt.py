@@ -8,6 +8,8 @@ import threading
 import time
 from contextlib import contextmanager
 
+from common.interrupts import SIGNALS
+
 PATIENCE = 5.0  # s until the line is printed
 LEAST = 0.1  # s; less time counts as none, because IPOPT refuses a limit of 0
 # Of a rocket for all tries of a solve, else for each one. `python baselines.py ID --solve-seconds` sets it.
@@ -79,7 +81,7 @@ class SolveClock:
 
 @contextmanager
 def interruptible():
-    """Raise at the block's end what a handler of SIGINT or SIGTERM raised in the block, even if CasADi swallowed it.
+    """Raise at the block's end what a handler of a signal raised in the block, even if CasADi swallowed it.
 
     By default that is KeyboardInterrupt. CasADi may take it for a failure of IPOPT, return nothing, raise a
     RuntimeError, or ignore it while it tries the types of an argument.
@@ -100,7 +102,7 @@ def interruptible():
 
     handlers = {}
     if threading.current_thread() is threading.main_thread():  # signals reach no other thread
-        handlers = {signum: signal.getsignal(signum) for signum in (signal.SIGINT, signal.SIGTERM)}
+        handlers = {signum: signal.getsignal(signum) for signum in SIGNALS}
         handlers = {signum: handler for signum, handler in handlers.items() if callable(handler)}
     try:
         for signum, handler in handlers.items():

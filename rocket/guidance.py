@@ -504,7 +504,7 @@ class Replanning:
         return self
 
     def __exit__(self, *error):
-        self.workers.close()
+        self.workers.__exit__(*error)
 
     def __call__(self, obs, t):
         if t == 0:

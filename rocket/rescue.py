@@ -9,7 +9,6 @@ Reading order: one flight, many flights, stored optima. CasADi and SciPy are imp
 
 from __future__ import annotations
 
-import os
 import sys
 from functools import lru_cache
 from typing import NamedTuple
@@ -18,7 +17,7 @@ import numpy as np
 
 from common.errors import NoOptimum
 from common.files import DAMAGED_NPZ
-from common.workers import Workers
+from common.workers import Workers, usable_cores
 from rocket import guidance
 from rocket.dispersion import DISPERSION, Vehicles, arc_masses, draw_vehicles
 from rocket.metrics import draws
@@ -155,7 +154,7 @@ def failing_optima(
     guess = guidance.guess_of(kept_reference(env_id, mission))
     jobs = [(mission.rocket, failing, row, guess) for row in z]
     if processes is None:
-        processes = max(1, min(os.cpu_count() or 1, len(jobs) // FLIGHTS_PER_PROCESS))
+        processes = max(1, min(usable_cores(), len(jobs) // FLIGHTS_PER_PROCESS))
     with Workers(processes) as workers:
         return workers.map(solve_rescue, jobs)
 

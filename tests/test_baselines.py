@@ -461,3 +461,13 @@ def test_bad_command_is_one_line(tmp_path, capsys, monkeypatch, arguments, messa
         baselines.parse_args([*arguments, "--json", "a.json"] if arguments else [])
     assert ended.value.code.startswith("error: ") and message in ended.value.code
     assert "\n" not in ended.value.code and capsys.readouterr().err == "" and not list(tmp_path.iterdir())
+
+
+def test_a_table_of_this_session_is_solved_here(monkeypatch):
+    """No other process would know it, although its id may be asked to be shared out."""
+    table = replace(VAN_DER_POL, env_id="OfThisSession-v0")
+    monkeypatch.setitem(PROBLEMS, table.env_id, table)
+    x0 = starts(4)
+    shared = optimise(table.env_id, x0, processes=2)
+    for mine, known in zip(shared, optimise("VanDerPol-v0", x0, processes=1)):
+        np.testing.assert_array_equal(mine, known)

@@ -2,8 +2,14 @@
 
 import hashlib
 import json
+import multiprocessing
 import os
 import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
 import types
 from pathlib import Path
 
@@ -13,8 +19,9 @@ import safetensors.torch
 import torch
 
 import evaluate
-from common import ipopt
+from common import interrupts, ipopt
 from common.checkpoints import LARGE, read_checkpoint, write_bfloat16
+from common.errors import NoOptimum
 from common.workers import Workers
 
 ROOT = Path(__file__).parent.parent
@@ -100,3 +107,64 @@ def test_closed_workers_do_nothing_more():
     workers.close()
     with pytest.raises(RuntimeError, match="after shutdown"):
         workers.map(about, [1])
+
+
+def children():
+    """The process ids of this process's children that solve."""
+    return [process.pid for process in multiprocessing.active_children()]
+
+
+def test_a_lost_worker_is_one_line():
+    with Workers(2) as workers:
+        workers.map(abs, [1, 2])
+        threading.Timer(0.2, lambda: os.kill(children()[0], signal.SIGKILL)).start()
+        with pytest.raises(NoOptimum, match="^a process that solves is lost"):
+            workers.map(time.sleep, [60, 60])
+
+
+def test_an_error_ends_the_workers_at_once():
+    began = time.monotonic()
+    with pytest.raises(ZeroDivisionError), Workers(2) as workers:
+        workers.map(abs, [1, 2])
+        workers.pool.submit(time.sleep, 60)
+        raise ZeroDivisionError
+    assert time.monotonic() - began < 30 and not children()
+
+
+def test_workers_end_with_the_process_that_is_killed(tmp_path):
+    """The script has no guard of its main part, which a worker must not run again."""
+    script = """
+import os, time
+from common.workers import Workers
+workers = Workers(2)
+print(*set(workers.map(os.getpgid, [0] * 8)), flush=True)
+workers.map(time.sleep, [60, 60])
+"""
+    path = tmp_path / "unguarded.py"
+    path.write_text(script)
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, str(path)]
+    process = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True, start_new_session=True)
+    assert process.stdout.readline() == f"{process.pid}\n"
+    process.kill()
+    process.stdout.read()  # ends when no process holds the stream
+    process.wait()
+
+
+def test_a_second_signal_does_not_interrupt(monkeypatch):
+    monkeypatch.setattr(interrupts, "came", [])
+    monkeypatch.setattr(interrupts, "state", {"last": -interrupts.GRACE, "is_saving": False})
+    monkeypatch.setattr(interrupts.time, "monotonic", lambda: now)
+    now = 10.0
+    with pytest.raises(KeyboardInterrupt):
+        interrupts.interrupt(signal.SIGTERM, None)
+    interrupts.interrupt(signal.SIGINT, None)
+    now = 20.0
+    with interrupts.uninterrupted():
+        interrupts.interrupt(signal.SIGINT, None)
+    with pytest.raises(KeyboardInterrupt):  # Python may have lost the first one
+        interrupts.interrupt(signal.SIGINT, None)
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    with pytest.raises(SystemExit) as end:
+        interrupts.leave()
+    assert end.value.code == 143

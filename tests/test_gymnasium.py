@@ -86,9 +86,9 @@ def test_gymnasiums_wrappers_take_the_native_batch():
         NormalizeObservation(make("RocketAscentCutoff-v0", 2))
 
 
-@pytest.mark.parametrize("mode", ["Disabled", "next", 3])
+@pytest.mark.parametrize("mode", ["disabled", "next", 3])
 def test_other_modes_are_refused(mode):
-    with pytest.raises(ValueError, match="autoreset_mode is .*; it must be 'SameStep' or 'NextStep'"):
+    with pytest.raises(ValueError, match="autoreset_mode is .*; it must be one of 'SameStep', 'NextStep', 'Disabled'"):
         make("DoubleIntegrator-v0", 2, autoreset_mode=mode)
 
 
@@ -136,5 +136,72 @@ def test_a_single_environment_has_no_autoreset(env_id):
 
 @every_kind
 def test_an_unknown_option_is_named(env_id):
-    with pytest.raises(BadInput, match="the option max_episode_steps is 5; it must be one of .*observe_phase"):
+    with pytest.raises(BadInput, match="unexpected .* 'max_episode_steps', 5; it must be one of .*observe_phase"):
         make(env_id, 2, max_episode_steps=5)
+
+
+@pytest.mark.parametrize("env_id", [*IDS, "MarsLanding-v0"])
+def test_a_seed_for_each_environment_is_the_single_environments(env_id):
+    options = {"dispersion": 1.0} if "Rocket" in env_id else {}
+    batch = make(env_id, 3, **options)
+    seeds = [5, 9, 5]
+    obs, _ = batch.reset(seed=seeds)
+    for row, seed in zip(obs, seeds):
+        np.testing.assert_array_equal(row, make(env_id, 1, **options).reset(seed=seed)[0][0])
+    np.testing.assert_array_equal(batch.reset(seed=np.array(seeds))[0], obs)
+    for wrong in ([1, 2], [1, 2, -3], [1, 2, 0.5]):
+        with pytest.raises(BadInput, match="seed is .*; it must be one whole number, or 3 of them"):
+            batch.reset(seed=wrong)
+
+
+@every_kind
+def test_a_mask_restarts_as_gymnasiums_own_vectors_do(env_id):
+    """Without autoreset the same masks, seeds and actions give what Gymnasium's vector of single environments gives."""
+    frame = {"action_frame": "local"} if "Rocket" in env_id else {}
+    mode = gym.vector.AutoresetMode.DISABLED
+    theirs = gym.vector.SyncVectorEnv([lambda: gym.make(env_id, **frame)] * 3, autoreset_mode=mode)
+    ours = make(env_id, 3, autoreset_mode="Disabled")
+    random = actions_of(ours, 2)
+    flight = range(ours.unwrapped.episode_steps + 3)
+    both = (ours, theirs)
+    for env in both:
+        env.reset(seed=[1, 2, 3])
+    for t in flight:
+        action = next(random).astype(ours.action_space.dtype)
+        (obs, rewards, terminated, _, _), (their_obs, their_rewards, their_ends, _, _) = (e.step(action) for e in both)
+        np.testing.assert_allclose(obs, their_obs, rtol=1e-6, atol=1e-9)
+        np.testing.assert_allclose(rewards, their_rewards, rtol=1e-6, atol=1e-9)
+        np.testing.assert_array_equal(terminated, their_ends)
+        mask = terminated | ([t == 1, False, False])
+        if not mask.any():
+            continue
+        if terminated.any():
+            with pytest.raises(gym.error.ResetNeeded, match="have ended"):
+                ours.step(action)
+        restarted, expected = (e.reset(seed=[t, t, t], options={"reset_mask": mask.copy()})[0] for e in both)
+        np.testing.assert_allclose(restarted, expected, rtol=1e-6, atol=1e-9)
+
+
+def test_a_mask_that_does_not_fit_is_refused():
+    batch = make("VanDerPol-v0", 2, autoreset_mode="Disabled")
+    with pytest.raises(gym.error.ResetNeeded, match="never begun"):
+        batch.reset(options={"reset_mask": np.array([True, False])})
+    batch.reset(seed=0)
+    for mask in ([True, False], np.array([1, 0]), np.array([True]), np.array([False, False])):
+        with pytest.raises(BadInput, match="reset_mask.* it must be an array of bool, of shape"):
+            batch.reset(options={"reset_mask": mask})
+
+
+@pytest.mark.parametrize("env_id", [*IDS, "MarsLanding-v0"])
+def test_torchrl_makes_checks_and_flies_them(env_id):
+    """TorchRL is not among our requirements. Its GymEnv tries options that our environments do not have."""
+    torchrl = pytest.importorskip("torchrl.envs")
+    env = torchrl.GymEnv(env_id)
+    torchrl.check_env_specs(env)
+    env.set_seed(3)
+    flight = env.rollout(4)
+    twin = gym.make(env_id)
+    twin.reset(seed=3)
+    twin.reset()
+    rewards = [twin.step(action.numpy())[1] for action in flight["action"]]
+    np.testing.assert_allclose(flight["next", "reward"][:, 0], rewards, rtol=1e-6)
