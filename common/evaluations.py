@@ -12,7 +12,6 @@ from common.command_line import typed_command
 from common.errors import BadInput
 from common.files import read_npz, write_json, write_npz
 from common.fingerprint import KEY, changes
-from common.policies import script_of
 from common.tasks import env_ids, task_of
 
 
@@ -71,6 +70,8 @@ def read_json(path: Path) -> dict:
 
 def resume_command(run_dir: Path) -> str:
     """The command line that goes on with a run. Only its flag if the run's files do not say of which script it is."""
+    from common.policies import script_of  # only an unfinished run needs it
+
     try:
         return typed_command(script_of(run_dir / "agent.safetensors").name, "--resume", run_dir)
     except BadInput:
