@@ -849,7 +849,7 @@ def test_a_full_disk_names_what_tensorboard_writes(tmp_path):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     writer = SimpleNamespace(add_scalar=no_space)
-    run = SimpleNamespace(folder=tmp_path, writer=writer, progress={"global_step": 1})
+    run = SimpleNamespace(folder=tmp_path, writer=writer, counters={"global_step": 1})
     with pytest.raises(OSError, match=f"No space left on device: '{tmp_path}'"):
         runs.Run.log(run, "eval", {"cost_mean": 1.0})
 
