@@ -23,14 +23,14 @@ from pathlib import Path
 import numpy as np
 
 import envs  # noqa: F401 - makes every id known to `task_of`
-from common.checkpoints import read_checkpoint, read_record, write_bfloat16
+from common.checkpoints import read_checkpoint, read_record, script_of, write_bfloat16
 from common.command_line import OneLineParser, integer, named_path, number, output_file, positive, utc
 from common.curves import evaluated, read_csv, read_curve, write_csv
 from common.errors import BadInput
 from common.evaluations import first_edited, read_evaluation, read_json, read_metrics, refuse_another_policy
 from common.files import read_npz, write_bytes, write_npz
 from common.interrupts import catch_signals, leave
-from common.policies import evaluate_by_script, script_of
+from common.policies import evaluate_by_script
 from common.schedule import Schedule
 from common.tasks import task_of
 from exports.folders import EPOCH, LAUNCH_LONGITUDE, export, page

@@ -16,10 +16,11 @@ from typing import Any, get_args
 import numpy as np
 import safetensors
 
-from common.errors import BadInput
+from common.errors import BadInput, refuse_unless
 from common.files import write_bytes
 from common.fingerprint import KEY
 
+ROOT = Path(__file__).resolve().parents[1]
 KINDS = {"F64": np.float64, "F32": np.float32, "F16": np.float16, "BF16": np.uint16, "I64": np.int64}
 LARGE = 10_000  # a tensor of this many numbers or more is shortened
 COUNTERS = {"seed": int, "total_updates": int, "global_step": int, "training_seconds": float, "wall_seconds": float}
@@ -70,6 +71,15 @@ def read_checkpoint(
     if not all(np.isfinite(tensor).all() for tensor in tensors.values()):
         raise BadInput(f"{flag}{path}: holds a NaN or an infinity; its weights must be finite")
     return {"args": args, "counters": counters, "tensors": tensors, KEY: metadata.get(KEY)}
+
+
+def script_of(checkpoint) -> Path:
+    """The script that trained an agent.safetensors. Raises BadInput if the file is bad or names no script."""
+    name = read_checkpoint(checkpoint, {"exp_name": str})["args"]["exp_name"]
+    scripts = {path.stem: path for path in ROOT.glob("ppo_gtrxl_*.py")}
+    allowed = f"must be that of a script, which flies it: {', '.join(sorted(scripts))}"
+    refuse_unless(name in scripts, f"the exp_name of {checkpoint}", repr(name), allowed)
+    return scripts[name]
 
 
 def read_metadata(data: bytes) -> dict[str, str]:

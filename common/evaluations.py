@@ -7,7 +7,7 @@ import json
 import shlex
 from pathlib import Path
 
-from common.checkpoints import read_record
+from common.checkpoints import read_record, script_of
 from common.command_line import typed_command
 from common.errors import BadInput
 from common.files import read_npz, write_json, write_npz
@@ -70,8 +70,6 @@ def read_json(path: Path) -> dict:
 
 def resume_command(run_dir: Path) -> str:
     """The command line that goes on with a run. Only its flag if the run's files do not say of which script it is."""
-    from common.policies import script_of  # only an unfinished run needs it
-
     try:
         return typed_command(script_of(run_dir / "agent.safetensors").name, "--resume", run_dir)
     except BadInput:

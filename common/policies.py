@@ -17,15 +17,6 @@ from common.errors import BadInput, refuse_unless
 ROOT = Path(__file__).parents[1]
 
 
-def script_of(checkpoint) -> Path:
-    """The script that trained an agent.safetensors. Raises BadInput if the file is bad or names no script."""
-    name = read_checkpoint(checkpoint, {"exp_name": str})["args"]["exp_name"]
-    scripts = {path.stem: path for path in ROOT.glob("ppo_gtrxl_*.py")}
-    allowed = f"must be that of a script, which flies it: {', '.join(sorted(scripts))}"
-    refuse_unless(name in scripts, f"the exp_name of {checkpoint}", repr(name), allowed)
-    return scripts[name]
-
-
 def evaluate_by_script(script: Path, checkpoint, flags: dict):
     """Run `script --eval-only` on a checkpoint, on the CPU. `flags` has fields of its Args.
 

@@ -6,7 +6,8 @@ import sys
 import tempfile
 from pathlib import Path
 
-from common.policies import ROOT, run_quietly, script_of
+from common.checkpoints import script_of
+from common.policies import ROOT, run_quietly
 from exports.extras import need
 
 
