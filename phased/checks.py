@@ -213,10 +213,7 @@ def try_functions(problem):
         check_tuple(problem, name, dynamics, (x, u), p, problem.states)
         if phase.conditions is not None:
             field = f"conditions of phase {k}"
-            conditions = phase.conditions
-            if problem.parameters is not None:
-                conditions = without_parameters(conditions)
-            count = check_tuple(problem, field, conditions, (x,), p, None)
+            count = check_tuple(problem, field, phase.conditions, (x,), p, None)
             aimed = sum(value is not None for value in problem.targets_of(phase))
             fits = not isinstance(phase.radius, tuple) or len(phase.radius) == aimed + count
             allowed = f"must be one number, or {aimed + count}: {aimed} for the target and {count} for the conditions"
@@ -249,11 +246,6 @@ def check_tuple(problem, field: str, function: Callable, arguments, p, count: in
     rows = as_rows(problem, field, values)
     check_alone(problem, field, function, arguments, p, rows)
     return len(rows)
-
-
-def without_parameters(function: Callable) -> Callable:
-    """A function that is called with p as its last argument, and does not take it."""
-    return lambda *arguments: function(*arguments[:-1])
 
 
 def last_flight(value):

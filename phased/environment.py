@@ -157,9 +157,10 @@ class PhasedVectorEnv(BatchedEnv):
         prices = [problem.bound_price, problem.constraint_price]
         x = tuple(problem.scale[:, None])
         u = problem.as_control(problem.u_unit[:, None])
-        values = [*problem.constraints_at(x, u, problem.hidden(np.zeros((1, problem.scores))))]
+        p = problem.hidden(np.zeros((1, problem.scores)))
+        values = [*problem.constraints_at(x, u, p)]
         for phase in problem.phases:
-            values += problem.misses(phase, x)
+            values += problem.misses(phase, x, p)
         return [
             *np.concatenate(radii),
             *bonuses,
@@ -442,7 +443,7 @@ def end_of_phase(problem: Problem, phase: Phase, x, p):
     cost = phase.Qf * distance**2
     if phase.terminal is not None:
         cost = cost + problem.with_parameters(phase.terminal, p)(x)
-    return cost, problem.circle_distance(phase, x), phase.circle_radius
+    return cost, problem.circle_distance(phase, x, p), phase.circle_radius
 
 
 def slope_along(event: Callable, x, dx) -> np.ndarray:

@@ -36,9 +36,10 @@ def flight_metrics(problem: Problem, flight: dict, reference: dict) -> dict:
     return metrics
 
 
-def hits_every_circle(problem: Problem, x: np.ndarray) -> np.ndarray:
+def hits_every_circle(problem: Problem, x: np.ndarray, p: tuple) -> np.ndarray:
     """Whether flights x (n, T+1, states) are in the target's circle at the end of every phase, (n,) bool.
 
+    p are the flights' hidden parameters, arrays (n,).
     With events the problem must have one phase, which ends at the last finite state.
     """
     hits = np.ones(len(x), dtype=bool)
@@ -47,7 +48,7 @@ def hits_every_circle(problem: Problem, x: np.ndarray) -> np.ndarray:
         step = last if problem.has_events else np.full(len(x), end)
         # computed as in the environment, because the optimum is on the circle's edge, where rounding decides
         state = tuple(x[np.arange(len(x)), step].T)
-        error = problem.circle_distance(phase, state)
+        error = problem.circle_distance(phase, state, p)
         hits &= error <= phase.circle_radius
     return hits
 
@@ -58,10 +59,12 @@ def comparable(problem: Problem, arrays: dict) -> np.ndarray:
     Skipping a circle is cheaper than hitting it, so a miss would count as better than the optimum. An optimum that hits
     every circle is the radius-constrained optimum, even if the constraint did not have to be imposed.
     """
-    compared = np.ones(len(arrays["x"]), dtype=bool)
+    n = len(arrays["x"])
+    compared = np.ones(n, dtype=bool)
+    p = problem.hidden(arrays.get("draw", np.zeros((n, problem.scores))))
     for suffix in ("", "_reference"):
         if problem.circles_count:
-            compared &= hits_every_circle(problem, arrays[f"x{suffix}"])
+            compared &= hits_every_circle(problem, arrays[f"x{suffix}"], p)
         compared &= arrays.get(f"arrived{suffix}", True)  # an older file does not say it
     return compared
 

@@ -132,7 +132,7 @@ def program(problem: Problem, mesh: PhaseMesh, defect: Callable, in_circles: boo
         if phase.terminal is not None:
             cost += problem.with_parameters(phase.terminal, parameters)(state)
         if phase.has_circle:
-            d = problem.misses(phase, state)
+            d = problem.misses(phase, state, parameters)
             radii = phase.radius if isinstance(phase.radius, tuple) else (phase.radius,) * len(d)
             circles.append(sum((di / r) ** 2 for di, r in zip(d, radii)))
     circles = circles if in_circles else []

@@ -37,7 +37,7 @@ class Phase:
     - `running(x, u)`, integrated over the phase's time, and `terminal(x)` at its end
 
     Every function of a table takes x as a tuple of states. With hidden parameters it also takes their tuple p as its
-    last argument: f(x, u, p), running(x, u, p), terminal(x, p), end(x, p). `conditions(x)` takes the states alone.
+    last argument: f(x, u, p), running(x, u, p), terminal(x, p), end(x, p), conditions(x, p).
     """
 
     steps: int  # duration / dt; with `end` the longest duration
@@ -261,14 +261,14 @@ class Problem:
         """The signed distances to the target, of the states that have one."""
         return [xi - target for xi, target in zip(x, self.targets_of(phase)) if target is not None]
 
-    def misses(self, phase: Phase, x) -> list:
+    def misses(self, phase: Phase, x, p) -> list:
         """What `radius` bounds: the signed distances to the target, and then the conditions."""
-        conditions = () if phase.conditions is None else phase.conditions(x)
+        conditions = () if phase.conditions is None else self.with_parameters(phase.conditions, p)(x)
         return [*self.distances(phase, x), *conditions]
 
-    def circle_distance(self, phase: Phase, x) -> np.ndarray:
+    def circle_distance(self, phase: Phase, x, p) -> np.ndarray:
         """The norm (n,) of `misses` at states x, a tuple of arrays; in radii if `radius` is a tuple."""
-        d = self.misses(phase, x)
+        d = self.misses(phase, x, p)
         if not d:
             return np.zeros_like(x[0])
         if isinstance(phase.radius, tuple):

@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from helpers import NETWORK, headline_of
+from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
 from scipy.integrate import solve_ivp
 from scipy.special import erf
 from scipy.stats import norm
@@ -27,6 +29,8 @@ from common.tasks import task_of
 from drawing.evaluation import draw_figures
 from envs import PROBLEMS, Phase, Problem, fly
 from phased import optimum as optimum_module
+from phased.figures import add_circle
+from phased.metrics import comparable
 from phased.problem import flights_of_seed
 from problems.cart_pole import CART_POLE, cart_pole
 from problems.goddard import GODDARD
@@ -741,6 +745,28 @@ def test_a_running_cost_of_a_step_is_summed(new_problem):
     )
     flight = envs.fly("Impulses-v0", lambda obs, t: np.array([[1.0]]), np.array([[2.0]]))
     assert flight["cost"][0] == 2**2 + 3**2 + 4**2 + 5**2
+
+
+def test_a_condition_knows_the_hidden_parameters(new_problem):
+    """The least integral of u^2 in a second that brings x to within r of p is the square of the way."""
+    meet = Phase(10, radius=0.01, bonus=20.0, running=lambda x, u, p: u**2, conditions=lambda x, p: (x[0] - p[0],))
+    drawn = {"scores": 1, "parameters": lambda z: (0.5 * z[0],)}
+    problem = Problem("Meet-v0", lambda x, u, p: (u,), 3.0, (meet,), (9.0,), x0_max=0.0, **drawn)
+    new_problem(problem)
+    draw = np.array([[1.0], [-2.0]])
+    flight = baselines.reference("Meet-v0", np.zeros((2, 1)), draw)
+    np.testing.assert_allclose(flight["cost"], [0.49**2, 0.99**2], rtol=1e-6)
+    arrays = {"x": flight["x"], "x_reference": flight["x"], "draw": draw}
+    assert comparable(problem, arrays).tolist() == [True, True]
+    assert comparable(problem, arrays | {"draw": -draw}).tolist() == [False, False]
+
+
+def test_an_ellipse_with_a_condition_is_drawn():
+    phase = Phase(5, (0.5, 0.0), (0.2, 0.1, 0.3), conditions=lambda x: (x[0] * x[1],))
+    problem = Problem("Ellipse-v0", lambda x, u: (x[1], u), 1.0, (phase,), (9.0, 9.0))
+    ellipse = add_circle(problem, phase, Figure().subplots())
+    assert isinstance(ellipse, Ellipse)
+    assert (ellipse.width, ellipse.height) == (0.4, 0.2)
 
 
 @pytest.mark.slow
