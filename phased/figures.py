@@ -154,7 +154,7 @@ def add_circle(problem: Problem, phase: Phase, plane, zorder: int = 3):
         return None
     look = {"fill": False, "zorder": zorder, **TARGET}
     if isinstance(phase.radius, tuple):
-        width, height = (2 * radius for radius in phase.radius)
+        width, height = (2 * radius for radius in phase.radius[:2])  # after them come the radii of conditions
         return plane.add_patch(Ellipse(target, width, height, **look))
     return plane.add_patch(Circle(target, phase.radius, **look))
 
