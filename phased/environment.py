@@ -429,8 +429,8 @@ class PhasedVectorEnv(BatchedEnv):
 
 def flown(problem: Problem, phase: Phase, x, u, p, h) -> tuple:
     """(x, running, excess, worst) of a step of h seconds: `Problem.advance` and `Problem.violation`."""
-    x, running, points = problem.advance(phase, x, u, p, h)
-    return x, running, *problem.violation(points, u, p, h)
+    after, running, points = problem.advance(phase, x, u, p, h)
+    return after, running, *problem.violation(x, points, u, p, h)
 
 
 def end_of_phase(problem: Problem, phase: Phase, x, p):

@@ -80,15 +80,19 @@ def time_figure(problem: Problem, arrays: dict, title: str) -> Figure:
 
 
 def plot_constraints(problem: Problem, arrays: dict, ax):
-    """Plot the largest constraint at each step's end, which must not be above 0."""
+    """Plot the largest constraint at both ends of each step, or where a discrete step begins. It must not exceed 0."""
     draw = arrays.get("draw", np.zeros((len(arrays["x"]), problem.scores)))[:SHOWN]
-    p = tuple(value[:, None] for value in problem.hidden(draw))
+    p = tuple(value[:, None, None] for value in problem.hidden(draw))
+    t = arrays["t"]
+    sides = 2 if problem.step is None else 1
+    times = np.column_stack([t[:-1], t[1:]])[:, :sides]
     for suffix, style in (("", POLICY), ("_reference", OPTIMUM)):
-        x = arrays[f"x{suffix}"][:SHOWN, 1:]
-        u = arrays[f"u{suffix}"][:SHOWN].reshape(*x.shape[:2], problem.controls)
+        x = arrays[f"x{suffix}"][:SHOWN]
+        x = np.stack([x[:, :-1], x[:, 1:]], axis=2)[:, :, :sides]  # (flights, T, sides, n)
+        u = arrays[f"u{suffix}"][:SHOWN].reshape(*x.shape[:2], 1, problem.controls)
         values = problem.constraints_at(tuple(np.moveaxis(x, -1, 0)), problem.as_control(np.moveaxis(u, -1, 0)), p)
-        largest = np.maximum.reduce(np.broadcast_arrays(*values))
-        ax.plot(np.broadcast_to(arrays["t"][1:], largest.shape).T, largest.T, **style)
+        largest = np.maximum.reduce(np.broadcast_arrays(x[..., 0], *values)[1:])
+        ax.plot(times.ravel(), largest.reshape(len(x), -1).T, **style)
     ax.axhline(0.0, **{**BOUNDARY, "linestyle": "--"})
 
 

@@ -53,14 +53,16 @@ class PhaseMesh(NamedTuple):
 
 def shooting(problem: Problem, phase: Phase, x, u, p, h, x_next):
     """Defect of multiple shooting, x_{k+1} - step(x_k, u_k) with the environment's step, the running cost, and the
-    states at which constraints hold.
+    states after the step's beginning at which constraints hold.
     """
     after, running, points = problem.advance(phase, x, u, p, h)
-    return tuple(b - a for a, b in zip(after, x_next)), running, [*points[:-1], x_next]
+    ends = [*points[:-1], x_next] if points else []
+    return tuple(b - a for a, b in zip(after, x_next)), running, ends
 
 
 def hermite_simpson(problem: Problem, phase: Phase, x, u, p, h, x_next):
-    """Defect of direct collocation, the running cost by Simpson's rule, and the states at which constraints hold.
+    """Defect of direct collocation, the running cost by Simpson's rule, and the states at which constraints hold after
+    the step's beginning.
 
     A cubic through both ends of the step obeys x' = f(x, u) at mid-step, with a held control. Source: Hargraves and
     Paris (1987), in the compressed form of Betts, Practical Methods for Optimal Control, section 4.5.
@@ -123,6 +125,10 @@ def program(problem: Problem, mesh: PhaseMesh, defect: Callable, in_circles: boo
                 events.append((problem.with_parameters(phase.end, parameters)(state_next), is_last))
             if problem.u_norm is not None:
                 norms.append(sum(ui**2 for ui in controls))
+            for value in problem.constraints_at(state, control, parameters):
+                # what the new control leaves as it is has been asked at the end of the step before
+                if ca.depends_on(ca.SX(value), u[:, t]) or (problem.step is not None and t > 0):
+                    constraints.append(value)
             for point in points:
                 constraints += problem.constraints_at(point, control, parameters)
             state = state_next
@@ -445,8 +451,15 @@ def solve_on(problem: Problem, mesh: PhaseMesh, job: StartJob, sketches: list[Sk
     if problem.constraints:  # the last rows
         a_step = problem.substeps if job.defect is shooting else 2
         count = len(problem.constraints_at(tuple(job.x0), problem.as_control(problem.u_centre), tuple(p)))
-        rows = found["lam_g"].full()[-count * a_step * sum(mesh.counts) :, 0]
-        constraint_price = float(np.abs(rows).max() / problem.dt * mesh.refine * a_step)
+        events = sum(number for number, phase in zip(mesh.counts, problem.phases) if phase.end is not None)
+        norms = 0 if problem.u_norm is None else sum(mesh.counts)
+        rows = np.abs(found["lam_g"].full()[begin + circles + events + norms :, 0])
+        # the environment's integral counts half of the flight's last state, and of both ends of a step if u is limited
+        if problem.step is None and len(rows) > count * a_step * sum(mesh.counts):
+            rows *= 2
+        elif problem.step is None:
+            rows[-count:] *= 2
+        constraint_price = float(rows.max(initial=0.0) / problem.dt * mesh.refine * a_step)
     return Solution(mesh, unknowns, float(found["f"]), multipliers, bound_price, constraint_price, status)
 
 

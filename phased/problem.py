@@ -91,8 +91,9 @@ class Problem:
     has no event, and `running` is a sum over the steps.
 
     `bounds` are constraints in the optimum. The environment charges `bound_price` for each second at a distance of one
-    `x_scale` beyond them. `constraints`(x, u) are numbers that must not be above 0 at the end of any Runge-Kutta step.
-    The environment charges `constraint_price` for each second of an excess of 1. Both functions take p last.
+    `x_scale` beyond them. `constraints`(x, u) are numbers that must not be above 0 at the beginning of a step and at
+    the end of each of its Runge-Kutta steps; with `step` at the beginning alone, where u acts. The environment charges
+    `constraint_price` for each second of an excess of 1. Both functions take p last.
 
     `single_optimum` promises that IPOPT ends in the same optimum from every guess, so the reference tries one guess
     (`guesses` of phased/optimum.py). Without it the reference is the best of several.
@@ -285,13 +286,13 @@ class Problem:
         """(x_next, cost, points): the states after h seconds, the cost `running` until then, and what lies between.
 
         The cost is an integral, or 0 without `running`. `points` are the states after each Runge-Kutta step; the last
-        ones are x_next. x is a tuple of n arrays or symbols, u is one of them or a tuple, and p has the hidden
-        parameters.
+        ones are x_next. With `step` there are none. x is a tuple of n arrays or symbols, u is one of them or a tuple,
+        and p has the hidden parameters.
         """
         running = None if phase.running is None else self.with_parameters(phase.running, p)
         if self.step is not None:
             after = self.with_parameters(self.step, p)(x, u)
-            return after, 0.0 if running is None else running(x, u), [after]
+            return after, 0.0 if running is None else running(x, u), []
         f = self.with_parameters(phase.f or self.f, p)
         h = h / self.substeps if self.substeps > 1 else h
         points = []
@@ -310,18 +311,24 @@ class Problem:
         """The values of `constraints`, or () without it."""
         return () if self.constraints is None else self.with_parameters(self.constraints, p)(x, u)
 
-    def violation(self, points, u, p, h) -> tuple:
-        """(excess, worst) of a step of h seconds: the integral of what exceeds 0, and the largest constraint.
+    def violation(self, x, points, u, p, h) -> tuple:
+        """(excess, worst) of a step of h seconds from x: the integral of what exceeds 0, and the largest constraint.
 
-        `points` are those of `advance`. Without constraints they are 0 and -inf.
+        `points` are those of `advance`. The integral is by the trapezoidal rule; with `step` the excess lasts h.
+        Without constraints they are 0 and -inf.
         """
         excess = 0.0
         worst = -math.inf
-        for x in points if self.constraints else ():
-            for value in self.constraints_at(x, u, p):
-                excess = excess + np.maximum(value, 0.0) * h / len(points)
+        if self.constraints is None:
+            return excess, worst
+        shares = [1.0]
+        if points:
+            shares = [0.5, *[1.0] * (len(points) - 1), 0.5]
+        for point, share in zip([x, *points], shares):
+            for value in self.constraints_at(point, u, p):
+                excess = excess + share * np.maximum(value, 0.0)
                 worst = np.maximum(worst, value)
-        return excess, worst
+        return excess * h / sum(shares), worst
 
     def as_control(self, u):
         """Rows u (m, ...) as the table's functions take them: one row, or a tuple of rows."""

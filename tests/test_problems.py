@@ -717,6 +717,34 @@ def test_obstacles_are_passed_between_steps_too(new_problem):
     assert straight["constraint_max"][0] == pytest.approx(depth.max())
 
 
+def test_a_limit_of_controls_holds_where_a_step_begins(new_problem):
+    """x' = u with u <= x makes a step of h seconds grow x by the factor 1 + h, as a held control has to."""
+    h = 0.5
+    limit = {"x0": (1.0,), "x0_max": 0.0, "constraints": lambda x, u: (u - x[0],), "constraint_price": 30.0}
+    growth = Phase(2, terminal=lambda x: -x[0])
+    problem = Problem("Growth-v0", lambda x, u: (u,), 5.0, (growth,), (30.0,), h, **limit)
+    flight, finer = optimum(problem, new_problem)
+    assert flight["cost"][0] == pytest.approx(-((1 + h) ** 2), abs=1e-6)
+    # u_0 larger by e gains h (1 + h) e, and is charged for half a step, in which the excess falls to less than 0
+    assert finer["constraint_price_needed"] == pytest.approx(2 * (1 + h), rel=1e-5)
+    fast = envs.fly("Growth-v0", lambda obs, t: np.array([[3.0]]), np.array([[1.0]]))
+    assert fast["cost_constraints"][0] == pytest.approx(30.0 * h * ((2.0 + 0.5) / 2 + 0.5 / 2))
+    assert fast["constraint_max"][0] == 2.0
+
+
+def test_a_discrete_limit_is_of_the_state_in_which_the_control_acts(new_problem):
+    """At most half of what is left may be spent in a step, so after two steps a quarter is left."""
+    limit = {"x0": (1.0,), "x0_max": 0.0, "constraints": lambda x, u: (u - x[0] / 2,), "constraint_price": 30.0}
+    spend = Phase(2, terminal=lambda x: x[0])
+    table = {"step": lambda x, u: (x[0] - u,), "u_max": 1.0, "phases": (spend,), "x_max": (9.0,)}
+    problem = Problem("Spend-v0", **table, **limit)
+    flight, finer = optimum(problem, new_problem)
+    assert flight["cost"][0] == pytest.approx(0.25, abs=1e-6)
+    assert finer["constraint_price_needed"] == pytest.approx(1 / problem.dt, rel=1e-5)
+    all_at_once = envs.fly("Spend-v0", lambda obs, t: np.array([[1.0]]), np.array([[1.0]]))
+    assert all_at_once["cost_constraints"][0] == pytest.approx(30.0 * problem.dt * (0.5 + 1.0))
+
+
 def test_a_step_in_closed_form_is_the_same_problem(new_problem):
     """The double integrator's exact step gives the flights and the optimum of its derivatives."""
     h = 0.1
