@@ -235,8 +235,10 @@ class BatchedEnv(VectorEnv):
     def refuse_options(self, options: dict, known: list[str], none: str = "there are none"):
         """Raise BadInput if a reset has an option that is not among these. `none` says why none is known."""
         if options.keys() - set(known):
-            names = " and ".join(map(repr, known)) or none
-            allowed = {0: none, 1: f"the only one is {names}"}.get(len(known), f"they may be {names}")
+            names = " and ".join(map(repr, known))
+            allowed = f"the only one is {names}" if len(known) == 1 else f"they may be {names}"
+            if not known:
+                allowed = none
             raise BadInput(f"reset options are {options!r}; {allowed}")
 
     def rows_of(self, options: dict, name: str, width: int, holds: Callable = np.isfinite, allowed: str = "finite"):

@@ -39,8 +39,8 @@ def flight_metrics(problem: Problem, flight: dict, reference: dict) -> dict:
 def hits_every_circle(problem: Problem, x: np.ndarray, p: tuple) -> np.ndarray:
     """Whether flights x (n, T+1, states) are in the target's circle at the end of every phase, (n,) bool.
 
-    p are the flights' hidden parameters, arrays (n,).
-    With events the problem must have one phase, which ends at the last finite state.
+    p are the flights' hidden parameters, arrays (n,). With events the problem must have one phase, which ends at the
+    last finite state.
     """
     hits = np.ones(len(x), dtype=bool)
     last = np.isfinite(x).all(axis=2).sum(axis=1) - 1
