@@ -81,8 +81,10 @@ class Args:
     observe_draw: flags.Observed = False  # show mass, gravity and failure to the policy, which no real flight knows
     # probability of a hidden failure (None: the lander's)
     failure_probability: Annotated[flags.Share | None, flags.Policy.SUGGESTS] = None
-    # a failure divides the thrust along one axis by this (None: the lander's)
+    # a failure divides the thrust along x or y by this (None: the lander's)
     failure_size: Annotated[float | None, flags.Range(1.0, 100.0), flags.Policy.SUGGESTS] = None
+    # a failure divides the thrust along z by this (None: the lander's)
+    failure_vertical: Annotated[float | None, flags.Range(1.0, 100.0), flags.Policy.SUGGESTS] = None
     # when a failure strikes: at the "start" or at a "random" moment of the first 40 s
     failure_time: Annotated[str, flags.Words(FAILURE_TIMES), flags.Policy.SUGGESTS] = "start"
     # seconds between two commands of the policy, a multiple of 0.2
@@ -190,7 +192,7 @@ def recipe(args):
 ENV_IDS = tuple(LANDERS)
 ENV_OPTIONS = (  # arguments of the environments
     "observe_phase", "observe_velocity", "observe_command", "observe_draw",
-    "failure_probability", "failure_size", "failure_time", "decision_s", "longest_flight",
+    "failure_probability", "failure_size", "failure_vertical", "failure_time", "decision_s", "longest_flight",
 )  # fmt: skip
 FIXED_OPTIONS = {}  # arguments that no flag sets
 INITIAL_ACTION = [0.0, 0.0, 0.4]  # thrust straight up, a little more than the weight
@@ -265,12 +267,13 @@ def curriculum(args, progress):
         "failed_fuel_share": args.failed_fuel_share,
         "slope_price": args.slope_weight.at(progress),
         "failure_probability": min(args.failure_emphasis * probability, 1.0),
-        "failure_size": args.training_failure_size,
         "thrust_share": args.thrust_share,
         "start_spread": args.start_spread,
         "wind": args.wind.at(progress),
         "decision_s": max(round(hold), 1) * PERIOD,
     }
+    if args.training_failure_size is not None:
+        training["failure_sizes"] = args.training_failure_size, args.training_failure_size
     if args.log_std.has_points:
         std = math.exp(args.log_std.at(progress))
         training["position_scale"] = max(30 * std, POSITION_SCALE)

@@ -23,12 +23,11 @@ from common.files import write_json
 from common.policies import competitors, fly_by_script
 from landing.environment import fly_lander
 from landing.guidance import LAWS, Replanned, drdv, drdv_estimated
-from landing.lander import LANDERS, Lander, draw_flights
-from landing.metrics import draws, flight_metrics, fly_draws
+from landing.lander import LANDERS, MARS, Lander, draw_flights
+from landing.metrics import FAILURE, draws, flight_metrics, fly_draws
 from landing.optimum import references
 
 POLICY_SCRIPT = Path(__file__).parents[1] / "ppo_gtrxl_lander.py"
-FAILURE = ("failure_probability", "failure_size", "failure_time")
 SOLVING = {"replanned", "replanned_wary"}  # laws that fly only the first draws
 TIMED_FLIGHTS = 100  # flights in a batch when a decision is timed
 
@@ -42,6 +41,9 @@ PUBLISHED = {
 }
 PUBLISHED_KEYS = ("position_error_mean_m", "position_error_max_m", "speed_mean_m_s", "speed_std_m_s", "speed_max_m_s")
 PUBLISHED_KEYS += ("fuel_mean_kg", "eval_starts")
+# the same notebooks fly the GRU with these failures, too: size, vertical size; then the row without its sigma
+STRESS = {(3.0, 1.5): (0.3, 7.6, 1.00, 1.17, 295.1, 10000), (2.5, 1.75): (1.0, 231.0, 1.12, 31.9, 295.1, 10000)}
+STRESS_KEYS = tuple(key for key in PUBLISHED_KEYS if key != "speed_std_m_s")
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -93,22 +95,24 @@ def decision_in_batch_us(env_id: str, make_law: Callable, z: np.ndarray, **optio
     return 1e6 * spent / calls
 
 
-def law_makers(lander: Lander, failure: dict) -> dict[str, Callable]:
+def law_makers(lander: Lander) -> dict[str, Callable]:
     """{name of `LAWS`: make_law}, where make_law(z) gives the law for the flights of draws z (n, 13)."""
     return {
-        "drdv": lambda z: drdv(lander, draw_flights(lander, z, *failure.values()).gravity.T),
+        "drdv": lambda z: drdv(lander, draw_flights(lander, z, lander.failure).gravity.T),
         "drdv_estimated": lambda z: drdv_estimated(lander),
         "replanned": lambda z: Replanned(lander),
         "replanned_wary": lambda z: Replanned(lander, is_wary=True),
     }
 
 
-def fly_laws(env_id: str, failure: dict, eval_seed: int, n: int, solved: int) -> dict:
-    """{name: metrics} of every law, then of the optimum."""
+def fly_laws(env_id: str, failure: dict, eval_seed: int, n: int, solved: int, names=tuple(LAWS)) -> dict:
+    """{name: metrics} of the laws `names`, then of the optimum."""
     z = draws(eval_seed, n)
     optimum = references(env_id, z[:solved], **failure)
     rows = {}
-    for name, make_law in law_makers(LANDERS[env_id], failure).items():
+    for name, make_law in law_makers(LANDERS[env_id]).items():
+        if name not in names:
+            continue
         flown = z[:solved] if name in SOLVING else z
         rows[name] = fly_law(env_id, make_law, flown, optimum["fuel_kg"], **failure)
         timed = z[: 4 if name in SOLVING else TIMED_FLIGHTS]
@@ -130,12 +134,24 @@ def published_rows(env_id: str, eval_seed: int, n: int) -> dict:
     z = draws(eval_seed, n)
     rows = {}
     for probability in (0.0, lander.failure_probability):
-        failure = {"failure_probability": probability, "failure_size": lander.failure_size, "failure_time": "start"}
-        make_law = law_makers(lander, failure)["drdv"]
+        make_law = law_makers(lander)["drdv"]
         for published_end in (False, True):
-            flown = fly_draws(env_id, make_law, z, published_end=published_end, **failure)
+            options = {"failure_probability": probability, "published_end": published_end}
+            flown = fly_draws(env_id, make_law, z, **options)
             end = "published" if published_end else "exact"
             rows[f"drdv, p = {probability:g}, {end} end"] = {"eval_starts": n} | flight_metrics(flown)
+    return rows
+
+
+def stress_rows(env_id: str, checkpoints: dict, failure: dict, eval_seed: int, n: int, solved: int) -> dict:
+    """{"size / vertical size: name": metrics} of the policies, of replanning and as printed, for each of `STRESS`."""
+    rows = {}
+    for (size, vertical), printed in STRESS.items():
+        harder = failure | {"failure_size": size, "failure_vertical": vertical}
+        flown = {name: fly_checkpoint(path, harder, eval_seed, n) for name, path in checkpoints.items()}
+        flown |= fly_laws(env_id, harder, eval_seed, n, solved, ("replanned",))
+        flown["GRU, 60 steps, printed"] = dict(zip(STRESS_KEYS, printed))
+        rows |= {f"{size:g} / {vertical:g}: {name}": row for name, row in flown.items()}
     return rows
 
 
@@ -157,10 +173,11 @@ COLUMNS = (  # heading, keys of a row, number format, width
 
 def table(report: dict) -> str:
     """opponents.json as a table: a line for each competitor, then the published rows."""
-    width = max(len(name) for part in ("laws", "published_law", "published") for name in report[part])
+    parts = [part for part in ("laws", "published_law", "published", "stress") if part in report]
+    width = max(len(name) for part in parts for name in report[part])
     lines = [f"{report['env_id']}, the draws of eval seed {report['eval_seed']}, the same for all"]
     lines.append(" " * (width + 2) + "".join(f"  {heading:>{w}}" for heading, _, _, w in COLUMNS) + "  knows")
-    for part in ("laws", "published_law", "published"):
+    for part in parts:
         for name, row in report[part].items():
             lines.append(f"  {name:<{width}}" + "".join(f"  {cell(row, *column):>{column[3]}}" for column in COLUMNS))
             lines[-1] += f"  {row.get('knows', '')}".rstrip()
@@ -206,11 +223,13 @@ def compare(
     refuse_unless(solved <= n, "--solved", solved, f"must be at most --starts, {n}")
     checkpoints = competitors(env_id, folder, also, LAWS)
     metrics = json.loads((folder / "eval.json").read_text())
-    failures = {name: metrics[name] for name in FAILURE}
+    failures = {name: metrics.get(name, getattr(LANDERS[env_id], name, None)) for name in FAILURE}  # older files
     rows = {name: fly_checkpoint(path, failures, eval_seed, n) for name, path in checkpoints.items()}
     rows |= fly_laws(env_id, failures, eval_seed, n, solved)
     published = {name: dict(zip(PUBLISHED_KEYS, values)) for name, values in PUBLISHED.items()}
     report = {"env_id": env_id, "eval_seed": eval_seed, "solved": solved} | failures
     report |= {"laws": rows, "published_law": published_rows(env_id, eval_seed, n), "published": published}
+    if LANDERS[env_id] is MARS:
+        report["stress"] = stress_rows(env_id, checkpoints, failures, eval_seed, n, solved)
     write_json(folder / "opponents.json", report)
     print(table(report))

@@ -16,7 +16,7 @@ from common.batch import RENDERED, BatchedEnv, SingleEnv, Training, check_option
 from common.errors import is_finite, refuse_unless
 from common.flying import fly_until_ended
 from landing.dynamics import Arc
-from landing.lander import DRAW, LANDERS, Flights, Lander, check_failure, draw_flights
+from landing.lander import DRAW, LANDERS, Failure, Flights, Lander, check_failure, draw_flights
 from landing.rewards import (
     ALOFT_PRICE,
     FUEL_PRICE,
@@ -40,6 +40,14 @@ def is_multiple(seconds) -> bool:
     return is_finite(seconds) and seconds > 0 and abs(seconds / PERIOD % 1 - 0.5) > 0.5 - 1e-6
 
 
+SIZES = "must be two numbers of at least 1, the smaller first"
+
+
+def are_sizes(pair) -> bool:
+    """Whether `pair` is None or a least and a greatest size of failures."""
+    return pair is None or (len(pair) == 2 and all(map(is_finite, pair)) and 1 <= pair[0] <= pair[1])
+
+
 @dataclass(frozen=True)
 class LanderTraining(Training):
     """What a training of a lander hands over. The defaults are the reported reward, starts and failures."""
@@ -55,9 +63,11 @@ class LanderTraining(Training):
     thrust_share: float = numeric(1.0, high=1.0)  # share of the greatest thrust that a command may ask for
     start_spread: float = numeric(1.0)  # factor on the width of the starts along x and y
     wind: float = numeric(0.0)  # m/s^2, the amplitude of `sway`
+    # the least and the greatest size of a failure; None: all have the environment's
+    failure_sizes: tuple[float, float] | None = checked(None, are_sizes, SIZES)
+    failure_verticals: tuple[float, float] | None = checked(None, are_sizes, SIZES)
     # the environment's arguments of the same names, where they are not None
     failure_probability: float | None = numeric(None, high=1.0)
-    failure_size: float | None = numeric(None, low=1.0)
     decision_s: float | None = checked(None, lambda s: s is None or is_multiple(s), MULTIPLE)
 
 
@@ -97,6 +107,7 @@ class LanderVectorEnv(BatchedEnv):
         num_envs: int = 1,
         failure_probability: float | None = None,
         failure_size: float | None = None,
+        failure_vertical: float | None = None,
         failure_time: str = "start",
         observe_command: bool = True,
         observe_draw: bool = False,
@@ -111,8 +122,9 @@ class LanderVectorEnv(BatchedEnv):
         self.lander = lander
         self.failure_probability = lander.failure_probability if failure_probability is None else failure_probability
         self.failure_size = lander.failure_size if failure_size is None else failure_size
+        self.failure_vertical = lander.failure_vertical if failure_vertical is None else failure_vertical
         self.failure_time = failure_time
-        check_failure(self.failure_probability, self.failure_size, failure_time)
+        check_failure(self.failure_probability, self.failure_size, self.failure_vertical, failure_time)
         self.observe_command = observe_command
         self.observe_draw = observe_draw
         self.observe_velocity = observe_velocity
@@ -158,9 +170,15 @@ class LanderVectorEnv(BatchedEnv):
         self._hold = round(self.setting("decision_s") / PERIOD)
         self.episode_steps = math.ceil(self.longest_flight / self.dt - 1e-9) + self.published_end
 
+    @property
+    def failure(self) -> Failure:
+        """Which failures the flights draw. A training may draw their sizes from a range."""
+        sizes = self.training.failure_sizes or (self.failure_size, self.failure_size)
+        verticals = self.training.failure_verticals or (self.failure_vertical, self.failure_vertical)
+        return Failure(self.setting("failure_probability"), sizes, verticals, self.failure_time)
+
     def _drawn(self, draw) -> Flights:
-        failure = self.setting("failure_probability"), self.setting("failure_size"), self.failure_time
-        return draw_flights(self.lander, draw, *failure, self.training.start_spread)
+        return draw_flights(self.lander, draw, self.failure, self.training.start_spread)
 
     def _observation_space(self):
         """The box that holds every observation."""

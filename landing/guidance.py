@@ -2,7 +2,8 @@
 
     drdv              D'Souza's energy-optimal law, as published: it knows the true gravity
     drdv_estimated    the same law with each axis's effectiveness and gravity estimated in flight
-    Replanned         the fuel optimum of the rest of the flight, by IPOPT with the same estimate, every few seconds
+    Replanned         the fuel optimum of the rest of the flight, by IPOPT with the same estimate, every few seconds; it
+                      ends above the pad, and the last seconds go straight down
 
 A law is a function policy(obs (n, obs), t) -> action (n, 3), the command over the greatest thrust. obs is that of
 `LanderVectorEnv`, with a decision every 0.2 s. The last two laws remember something of each flight, and t = 0 begins
@@ -45,6 +46,11 @@ def energy_optimal_acceleration(r, v, seconds) -> np.ndarray:
     """
     t = np.maximum(seconds, SOONEST)[:, None]
     return -6 * r / t**2 - 4 * v / t
+
+
+def arriving_acceleration(r, v, r_end, v_end, seconds) -> np.ndarray:
+    """The same to r_end and v_end (3,) in `seconds` (n, 1): in axes that arrive there, moving with v_end."""
+    return energy_optimal_acceleration(r - r_end + v_end * seconds, v - v_end, seconds[:, 0])
 
 
 def drdv_acceleration(lander: Lander, obs) -> np.ndarray:
@@ -158,8 +164,10 @@ def drdv_estimated(lander: Lander) -> Callable:
 REPLAN_EVERY = 5.0  # s
 LAST_REPLAN = 12.0  # s before the planned touchdown; later plans postpone a touchdown that they cannot reach any more
 CHANGE = 0.05  # change of the estimated effectiveness that is replanned at once
-HANDOVER = 3.0  # s before the planned touchdown, when the energy-optimal law takes over
-OWN_TIME = 0.5  # s before the planned touchdown, when that law begins to choose the time to go
+HANDOVER = 3.0  # s before the plan's end, when the energy-optimal law takes over
+GATE = np.array([0.0, 0.0, 3.0, 0.0, 0.0, -5.0])  # m and m/s, where plans end, above the pad: the rest is straight down
+TOUCH = np.array([0.0, 0.0, -0.8])  # m/s, the velocity at touchdown
+SLOWEST = 0.5  # m/s downwards, by which the last seconds are reckoned where a flight has stopped sinking
 RESERVE = 0.95  # share of the greatest thrust that plans use; the rest is for the feedback
 WARY_RESERVE = 0.55  # the same share while the engine is whole, if a failure may come
 WHOLE = 0.85  # the least effectiveness of an engine that has not failed
@@ -173,9 +181,10 @@ class Replanned:
     """The law that flies the fuel optimum of the rest of the flight, solved again and again with the estimate.
 
     A flight is planned at its start, every `REPLAN_EVERY` seconds until `LAST_REPLAN`, and when the estimate of its
-    engine changes. A plan has `PLAN_INTERVALS` of held thrust. Between plans the plan's acceleration is flown with
-    feedback: the energy-optimal law takes back the flight's errors in r and v. The same law flies the last seconds. If
-    IPOPT fails, the last plan is kept. Without any plan DR/DV flies.
+    engine changes. A plan has `PLAN_INTERVALS` of held thrust and ends at `GATE`. Between plans the plan's acceleration
+    is flown with feedback: the energy-optimal law takes back the flight's errors in r and v. The same law flies the
+    last seconds to the gate, and then straight down, because a landing has to be steep. If IPOPT fails, the last plan
+    is kept. Without any plan DR/DV flies.
 
     With `is_wary` plans use little thrust until a failure is seen, so that a failure can still be survived. The optimum
     of a whole engine falls fast and brakes late. We flew 200 draws of a seed that docs/landing.md does
@@ -201,11 +210,15 @@ class Replanned:
         flights = self._due(obs, t)
         if len(flights):
             self._replan(obs, flights)
-        left = self.ends[:, -1] - now  # s; without a plan below 0
-        planned = self._acceleration(r, v, now)
-        own = energy_optimal_time(r, v, self.lander.gravity)
-        closing = energy_optimal_acceleration(r, v, np.where(left > OWN_TIME, left, own))
-        acceleration = np.where((left > HANDOVER)[:, None], planned, closing)
+        left = (self.ends[:, -1] - now)[:, None]  # s to the gate
+        closing = arriving_acceleration(r, v, GATE[:3], GATE[3:], left)
+        acceleration = np.where(left > HANDOVER, self._acceleration(r, v, now), closing)
+        sinks = np.maximum(-v[:, 2:], SLOWEST) - TOUCH[2]
+        down = arriving_acceleration(r, v, 0.0, TOUCH, 2 * r[:, 2:] / sinks)
+        acceleration = np.where(left > PERIOD / 2, acceleration, down)
+        if any(plan is None for plan in self.plans):
+            has_none = np.array([plan is None for plan in self.plans])[:, None]
+            acceleration = np.where(has_none, drdv_acceleration(self.lander, obs), acceleration)
         return self.estimate.command(acceleration) / self.lander.greatest_thrust
 
     def _begin(self, n: int):
@@ -262,7 +275,7 @@ class Replanned:
         for guess in guesses:
             mesh = LandingMesh.stretched(self.lander, PLAN_INTERVALS, guess.seconds)
             with suppress(NoOptimum):
-                found = solve_from_guess(self.lander, descent, guess, mesh, limits=limits)
+                found = solve_from_guess(self.lander, descent, guess, mesh, limits=limits, target=GATE)
                 return found, time.process_time() - begin
         return None, time.process_time() - begin
 

@@ -20,10 +20,18 @@ from common.registration import register
 
 FAILURE_TIMES = ("start", "random")
 LAST_FAILURE = 40.0  # s, before which "random" failures strike
-VERTICAL_LOSS = 1.5  # a failure of any size divides the thrust along z by this
 ROCK = 3340.0  # kg/m^3, the density of the Moon; Mars and the Earth are denser, and so smaller for their gravity
 G = 6.674e-11  # m^3/(kg s^2)
 MOST_NEGLECTED = 0.5  # share of gravity that flat ground may neglect
+
+
+class Failure(NamedTuple):
+    """Which failures flights draw. A size is what a failure divides thrust by; it is drawn from (least, greatest)."""
+
+    probability: float
+    sizes: tuple[float, float]  # along x or y
+    verticals: tuple[float, float]  # along z
+    time: str = "start"  # one of `FAILURE_TIMES`
 
 
 @dataclass(frozen=True)
@@ -44,6 +52,7 @@ class Lander:
     gravity_spread: float = 0.0  # the largest error of gravity in each axis, relative to `gravity`
     failure_probability: float = 0.0  # probability of a hidden failure, unless the environment is given another
     failure_size: float = 2.5  # a failure divides the thrust along one lateral axis by this
+    failure_vertical: float = 1.5  # and that along z by this
     longest: float = 100.0  # s, the longest flight
     radius: float | None = None  # m, of the planet, which tells how far flat ground holds (None: `ROCK`'s)
 
@@ -62,7 +71,7 @@ class Lander:
         allowed = f"must be above the weight of its dry mass, {weight:.0f} N, or it cannot brake"
         refuse_unless(self.greatest_thrust > weight, "a lander's greatest_thrust", self.greatest_thrust, allowed)
         refuse_unless(0 <= self.cant < 90, "a lander's cant", self.cant, "must be from 0 to below 90 degrees")
-        check_failure(self.failure_probability, self.failure_size)
+        check_failure(self.failure_probability, self.failure_size, self.failure_vertical)
         for name in ("start", "spread"):
             values = getattr(self, name)
             six = isinstance(values, tuple | list) and len(values) == 6 and all(map(is_finite, values))
@@ -79,6 +88,13 @@ class Lander:
     def exhaust(self) -> float:
         """The exhaust velocity in m/s: thrust in N for each kg/s of propellant."""
         return self.isp * self.g0 * math.cos(math.radians(self.cant))
+
+    @property
+    def failure(self) -> Failure:
+        """The failures of this table, from the start of the flights on."""
+        sizes = self.failure_size, self.failure_size
+        verticals = self.failure_vertical, self.failure_vertical
+        return Failure(self.failure_probability, sizes, verticals)
 
     @property
     def reach(self) -> tuple[float, float]:
@@ -120,11 +136,12 @@ def check_flatness(lander: Lander):
     refuse_unless(turned + carried <= MOST_NEGLECTED, "a lander's start", lander.start, allowed)
 
 
-def check_failure(probability: float, size: float, time: str = "start"):
+def check_failure(probability: float, size: float, vertical: float, time: str = "start"):
     """Raise BadInput for a failure that cannot be drawn."""
     in_unit = is_finite(probability) and 0 <= probability <= 1
     refuse_unless(in_unit, "failure_probability", repr(probability), "must be from 0 to 1")
-    refuse_unless(is_finite(size) and size >= 1, "failure_size", repr(size), "must be at least 1")
+    for name, divisor in (("failure_size", size), ("failure_vertical", vertical)):
+        refuse_unless(is_finite(divisor) and divisor >= 1, name, repr(divisor), "must be at least 1")
     refuse_unless(time in FAILURE_TIMES, "failure_time", repr(time), f"must be one of {', '.join(FAILURE_TIMES)}")
 
 
@@ -147,13 +164,13 @@ class Flights(NamedTuple):
 DRAW = ("x", "y", "z", "vx", "vy", "vz", "mass", "gx", "gy", "gz", "failure", "axis", "moment")
 
 
-def draw_flights(
-    lander: Lander, draw: np.ndarray, probability: float, size: float, time: str, start_spread: float = 1.0
-) -> Flights:
+def draw_flights(lander: Lander, draw: np.ndarray, failure: Failure, start_spread: float = 1.0) -> Flights:
     """The flights of draws (n, 13). `start_spread` widens the box of the starts, but not its heights and sink rates.
 
-    A flight has a failure if the draw's "failure" is below `probability`. The failure divides the thrust along x, if
-    "axis" is below 0.5, or along y by `size`. It divides the thrust along z by 1.5.
+    A flight has a failure if the draw's "failure" is below the probability. The failure weakens the thrust along x, if
+    "axis" is below 0.5, or along y, and the thrust along z. A number that has decided this is uniform again within what
+    it has chosen. This second number chooses a size between the least and the greatest: that of "failure" the vertical
+    one, that of "axis" the lateral one.
     """
     start = np.array(lander.start)
     spread = np.array(lander.spread)
@@ -162,16 +179,23 @@ def draw_flights(
     state = start + widths * spread * centred[:, :6]
     gravity = lander.gravity * lander.gravity_spread * centred[:, 7:10]
     gravity[:, 2] -= lander.gravity
-    has_failed = draw[:, 10] < probability
-    axis = (draw[:, 11] >= 0.5).astype(int)
+    has_failed = draw[:, 10] < failure.probability
     failed = np.ones((len(draw), 3))
     rows = np.flatnonzero(has_failed)
-    failed[rows, axis[rows]] = 1 / size
-    failed[rows, 2] = 1 / VERTICAL_LOSS
-    moment = LAST_FAILURE * draw[:, 12] if time == "random" else np.zeros(len(draw))
+    axis, lateral = np.divmod(2 * draw[rows, 11], 1)
+    vertical = draw[rows, 10] / failure.probability
+    failed[rows, np.minimum(axis, 1).astype(int)] = 1 / between(failure.sizes, lateral)
+    failed[rows, 2] = 1 / between(failure.verticals, vertical)
+    moment = LAST_FAILURE * draw[:, 12] if failure.time == "random" else np.zeros(len(draw))
     strike = np.where(has_failed, moment, np.inf)
     mass = lander.mass * (1 + lander.mass_spread * centred[:, 6])
     return Flights(state[:, :3].T.copy(), state[:, 3:].T.copy(), mass, gravity.T.copy(), failed.T.copy(), strike)
+
+
+def between(ends: tuple[float, float], share):
+    """The numbers (n,) at these shares (n,) of the way from the first end to the second."""
+    low, high = ends
+    return low + (high - low) * share
 
 
 MARS = Lander(

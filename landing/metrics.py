@@ -19,6 +19,7 @@ from landing.rewards import POSITION_LIMIT, SPEED_LIMIT
 FLIGHTS = 10_000  # the published code's number
 REFERENCE_STARTS = 200
 AT_ONCE = 1000  # flights of a batch, so that the caches of a policy stay below 0.2 GB
+FAILURE = ("failure_probability", "failure_size", "failure_vertical", "failure_time")  # options that say what fails
 KEPT_FLIGHTS = 15  # flights whose states eval.npz keeps
 
 
@@ -81,7 +82,7 @@ def evaluate_policy(env_id: str, policy: Callable, reference: dict, eval_seed: i
     solved = np.flatnonzero(reference["solved"])
     batch: Any = gym.make_vec(env_id, num_envs=1, **env_options)  # a LanderVectorEnv
     metrics = {"env_id": env_id, "eval_seed": eval_seed, "eval_starts": n} | flight_metrics(flown)
-    metrics |= {name: getattr(batch, name) for name in ("failure_probability", "failure_size", "failure_time")}
+    metrics |= {name: getattr(batch, name) for name in FAILURE}
     metrics |= {"decision_s": float(batch.dt), "reference_starts": len(solved)}
     for name, key in (("fuel_mean_kg", "fuel_kg"), ("final_time_mean_s", "final_time")):
         metrics[f"reference_{name}"] = float(reference[key][solved].mean())

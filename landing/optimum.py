@@ -17,7 +17,7 @@ from common.ipopt import SolveClock, interruptible, limit
 from common.workers import Workers
 from landing.dynamics import TINY, burn
 from landing.environment import PERIOD, LanderVectorEnv, make_lander_vector, state_of
-from landing.lander import DRAW, Flights, Lander, draw_flights
+from landing.lander import DRAW, Failure, Flights, Lander, draw_flights
 
 # ---------------------------------------------------------------------------------------------------------------------
 # A flight as it is solved
@@ -199,7 +199,13 @@ def landing_solver(lander: Lander, count: int, has_cone: bool):
     return ca.nlpsol("landing", "ipopt", program, options)
 
 
-def bounds_of(lander: Lander, mesh: LandingMesh, glide_slope: float | None, limits: tuple[float, float]) -> dict:
+def bounds_of(
+    lander: Lander,
+    mesh: LandingMesh,
+    glide_slope: float | None,
+    limits: tuple[float, float],
+    target: np.ndarray,
+) -> dict:
     """The bounds of a program's unknowns and constraints, for CasADi's `nlpsol`. `limits` of the thrust are in N."""
     count = len(mesh.fixed)
     units = units_of(lander)
@@ -211,7 +217,7 @@ def bounds_of(lander: Lander, mesh: LandingMesh, glide_slope: float | None, limi
         times = mesh.times(SHORTEST)
         left = times[-1] - times[1:]  # s that are left at least
         low[:, 2] = np.where(left > LAST_APPROACH, CLEARANCE / units[2], 0.0)
-    low[-1, :6] = high[-1, :6] = TOUCHDOWN / units[:6]
+    low[-1, :6] = high[-1, :6] = target / units[:6]
     ones = np.ones(3 * count)
     least, greatest = (np.array(limits) / lander.greatest_thrust) ** 2
     lbg = np.concatenate([np.zeros(7 * count), np.full(count, least), np.full(count, -np.inf)])
@@ -299,11 +305,13 @@ def solve_from_guess(
     mesh: LandingMesh,
     glide_slope: float | None = 0.0,
     limits: tuple[float, float] | None = None,
+    target: np.ndarray | None = None,
 ) -> Trajectory:
     """The path of least propellant to the pad, within the thrust `limits` (N), by default the engine's.
 
-    The path stays above a cone on the pad, with the angle `glide_slope` in degrees. 0 keeps it above the ground, None
-    allows any path. The failure strikes at the beginning of an interval. Raises NoOptimum if IPOPT finds none.
+    It ends with r (m) and v (m/s) of `target` (6,), by default at rest on the pad. The path stays above a cone on the
+    pad, with the angle `glide_slope` in degrees. 0 keeps it above the ground, None allows any path. The failure strikes
+    at the beginning of an interval. Raises NoOptimum if IPOPT finds none.
     """
     count = len(mesh.fixed)
     units = units_of(lander)
@@ -316,7 +324,8 @@ def solve_from_guess(
     tangent = np.tan(np.radians(glide_slope or 0.0))
     parameters = [descent.state / units, descent.gravity, effectiveness.ravel(), mesh.fixed, mesh.is_free, [tangent]]
     solve = landing_solver(lander, count, bool(glide_slope))
-    bounds = bounds_of(lander, mesh, glide_slope, limits or (lander.least_thrust, lander.greatest_thrust))
+    limits = limits or (lander.least_thrust, lander.greatest_thrust)
+    bounds = bounds_of(lander, mesh, glide_slope, limits, TOUCHDOWN if target is None else target)
     solution = solve(x0=np.concatenate(unknowns), p=np.concatenate(parameters), **bounds)
     status = solve.stats()["return_status"]
     if status != "Solve_Succeeded":
@@ -460,16 +469,15 @@ def references(env_id: str, draw: np.ndarray, processes: int = 1, **env_options)
     only the time. Raises NoOptimum if no draw has an optimum.
     """
     batch = make_lander_vector(env_id, **env_options)
-    failure = batch.failure_probability, batch.failure_size, batch.failure_time
     rows = np.ascontiguousarray(draw, dtype=np.float64).tobytes()
-    return dict(kept_references(batch.lander, rows, failure, processes))
+    return dict(kept_references(batch.lander, rows, batch.failure, processes))
 
 
 @lru_cache(maxsize=8)
-def kept_references(lander: Lander, rows: bytes, failure: tuple, processes: int) -> dict:
+def kept_references(lander: Lander, rows: bytes, failure: Failure, processes: int) -> dict:
     """`references` of draws that are given as the bytes of their array. Equal flights are solved once."""
     draw = np.frombuffer(rows).reshape(-1, len(DRAW))
-    drawn = draw_flights(lander, draw, *failure)
+    drawn = draw_flights(lander, draw, failure)
     _, first, of_draw = np.unique(np.vstack(drawn), axis=1, return_index=True, return_inverse=True)
     jobs = [(lander, drawn.one(k)) for k in first]
     if len(jobs) > 1:

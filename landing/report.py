@@ -26,7 +26,7 @@ def report_lander(env_id: str, starts: int, seed: int) -> tuple[dict, dict]:
 def report_constraints(env_id: str) -> tuple[dict, dict]:
     """Solve and print the optima of a lander's one start, with each of `CONSTRAINTS`."""
     lander = LANDERS[env_id]
-    flight = draw_flights(lander, draws(0, 1), 0.0, 1.0, "start")
+    flight = draw_flights(lander, draws(0, 1), lander.failure)
     numbers, arrays = {}, {}
     print(f"{env_id:<32}{'propellant (kg)':>16}{'duration (s)':>14}{'solved in (s)':>15}")
     for name, glide_slope in CONSTRAINTS.items():
@@ -52,7 +52,7 @@ def report_draws(env_id: str, starts: int, seed: int) -> tuple[dict, dict]:
     solved = references(env_id, z)
     numbers: dict[str, float] = {"starts": starts, "seed": seed, "solved": int(solved["solved"].sum())}
     numbers["solve_seconds"] = time.monotonic() - began
-    has_failed = np.isfinite(draw_flights(lander, z, lander.failure_probability, lander.failure_size, "start").strike)
+    has_failed = np.isfinite(draw_flights(lander, z, lander.failure).strike)
     is_solved = solved["solved"]
     groups = {"all": is_solved, "healthy": is_solved & ~has_failed, "failed": is_solved & has_failed}
     print(f"{env_id}: {starts} draws of seed {seed}, solved in {numbers['solve_seconds']:.0f} s")

@@ -42,5 +42,6 @@ def failure_lines(metrics: dict) -> list[str]:
         return []
     when = "at a random moment" if metrics["failure_time"] == "random" else "from the start"
     share = metrics["failure_probability"]
-    size = metrics["failure_size"]
-    return [f"  A share of {share:g} of the flights has a hidden failure {when}, of size {size:g}."]
+    size, vertical = metrics["failure_size"], metrics.get("failure_vertical", 1.5)  # older files do not tell
+    sizes = f"the thrust along x or y is divided by {size:g}, that along z by {vertical:g}"
+    return [f"  A share of {share:g} of the flights has a hidden failure {when}: {sizes}."]

@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 import envs
 from common.errors import BadInput
 from landing.environment import PERIOD, fly_lander, limited
-from landing.lander import DRAW, MARS, POWERED_DESCENT, draw_flights
+from landing.lander import DRAW, MARS, POWERED_DESCENT, Failure, draw_flights
 from landing.rewards import has_landed, slope_reward
 
 ID = "MarsLanding-v0"
@@ -78,11 +78,29 @@ def test_thrust_is_clipped_and_zero_points_up():
 
 def test_a_failure_divides_one_lateral_axis_and_the_vertical_one():
     draw = np.array([[*MIDDLE[0, :10], 0.2, axis, 0.25] for axis in (0.1, 0.9)])
-    flown = draw_flights(MARS, draw, 0.5, 2.5, "random")
+    failure = Failure(0.5, (2.5, 2.5), (1.5, 1.5), "random")
+    flown = draw_flights(MARS, draw, failure)
     assert flown.failed.T == pytest.approx(np.array([[0.4, 1.0, 1 / 1.5], [1.0, 0.4, 1 / 1.5]]))
     assert flown.strike == pytest.approx([10.0, 10.0])
-    healthy = draw_flights(MARS, draw, 0.2, 2.5, "random")
+    healthy = draw_flights(MARS, draw, failure._replace(probability=0.2))
     assert (healthy.failed == 1).all() and np.isinf(healthy.strike).all()
+
+
+def test_a_training_draws_the_sizes_of_failures_from_a_range():
+    """Uniformly, each apart from the other, and of as many flights along x as along y; a pair is checked."""
+    batch = gym.make_vec(ID, num_envs=4000, failure_probability=0.4)
+    batch.reset(seed=3, options={"training": {"failure_sizes": (1.0, 3.0), "failure_verticals": (1.0, 1.75)}})
+    failed = batch.flights.failed[:, np.isfinite(batch.flights.strike)]
+    assert failed.shape[1] / 4000 == pytest.approx(0.4, abs=0.03)
+    assert ((failed[0] < 1) != (failed[1] < 1)).all() and (failed[0] < 1).mean() == pytest.approx(0.5, abs=0.05)
+    lateral, vertical = 1 / failed[:2].min(axis=0), 1 / failed[2]
+    for sizes, greatest in ((lateral, 3.0), (vertical, 1.75)):
+        shares = np.histogram(sizes, 4, (1.0, greatest))[0] / len(sizes)
+        assert shares == pytest.approx(np.full(4, 0.25), abs=0.045)
+    assert abs(np.corrcoef(lateral, vertical)[0, 1]) < 0.08
+    for pair in ((3.0, 1.0), (0.5, 2.0), (1.0, np.inf), (1.0,)):
+        with pytest.raises(BadInput, match="^training's failure_sizes is .*; it must be two numbers of at least 1"):
+            batch.reset(options={"training": {"failure_sizes": pair}})
 
 
 def test_a_failure_strikes_at_its_moment():
@@ -292,6 +310,7 @@ def test_what_is_hidden_and_what_an_oracle_sees():
 BAD_OPTIONS = {
     "failure_probability": 1.5,
     "failure_size": 0.5,
+    "failure_vertical": 0.5,
     "failure_time": "late",
     "decision_s": 0.3,
     "longest_flight": 200.0,

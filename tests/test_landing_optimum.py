@@ -17,6 +17,8 @@ pytestmark = pytest.mark.slow
 LANDING, DESCENT = "MarsLanding-v0", "PoweredDescent-v0"
 RANDOM = {"failure_probability": 0.7, "failure_time": "random"}
 
+HEALTHY = MARS.failure._replace(probability=0.0)
+
 
 def rows(n, seed=0):
     """Draws (n, 13)."""
@@ -35,7 +37,7 @@ def played(u):
 @pytest.fixture(scope="module")
 def descent():
     """Its one flight, solved by glide slope."""
-    flight = draw_flights(POWERED_DESCENT, np.full((1, len(DRAW)), 0.5), 0.0, 2.5, "start")
+    flight = draw_flights(POWERED_DESCENT, np.full((1, len(DRAW)), 0.5), HEALTHY)
     return {slope: optimise_landing(POWERED_DESCENT, flight, slope) for slope in (None, 0.0, 4.0)}
 
 
@@ -134,7 +136,7 @@ def test_knowing_when_a_failure_strikes(mars):
 
 
 def test_the_guess_does_not_matter(monkeypatch):
-    drawn = draw_flights(MARS, rows(3, seed=5), 0.7, 2.5, "random")
+    drawn = draw_flights(MARS, rows(3, seed=5), MARS.failure._replace(probability=0.7, time="random"))
     found = []
     for share in (0.8, 1.3):
         monkeypatch.setattr(optimum, "DURATIONS", (share,))
@@ -153,10 +155,10 @@ def test_references_are_remembered_and_cannot_be_written_to(mars):
 def test_an_optimum_that_is_not_there_is_one_line():
     weak = replace(MARS, greatest_thrust=7000.0)  # 3.5 m/s^2
     with pytest.raises(NoOptimum, match="^landing: IPOPT stopped with [^\n]*$"):
-        optimise_landing(weak, draw_flights(weak, rows(1), 0.0, 2.5, "start"))
+        optimise_landing(weak, draw_flights(weak, rows(1), HEALTHY))
     brief = replace(MARS, longest=10.0)
     with pytest.raises(NoOptimum, match="^landing: it takes [^\n]* longer than a flight, 10 s$"):
-        optimise_landing(brief, draw_flights(brief, rows(1), 0.0, 2.5, "start"))
+        optimise_landing(brief, draw_flights(brief, rows(1), HEALTHY))
 
 
 APOLLO = Lander(
@@ -169,7 +171,7 @@ APOLLO = Lander(
 def test_a_start_may_be_far_away(x, speed, fuel):
     """Solved elsewhere with bounds of 100 km and 5 km/s."""
     far = replace(APOLLO, start=(x, 0.0, 6000.0, speed, 0.0, -50.0))
-    found = optimise_landing(far, draw_flights(far, np.full((1, len(DRAW)), 0.5), 0.0, 1.0, "start"), 0)
+    found = optimise_landing(far, draw_flights(far, np.full((1, len(DRAW)), 0.5), HEALTHY), 0)
     assert found["fuel_kg"] == pytest.approx(fuel, abs=0.05)
 
 
@@ -184,13 +186,13 @@ def test_a_least_thrust_above_the_weight_is_named(monkeypatch):
     monkeypatch.setattr(optimum, "DURATIONS", (0.8,))
     strong = replace(MARS, least_thrust=23000.0, start=(0.0, 0.0, 2000.0, 0.0, 0.0, 0.0), dry_mass=1800.0)
     with pytest.raises(NoOptimum, match="least_thrust, 23000 N, too great: the weight is 7423 N at first"):
-        optimise_landing(strong, draw_flights(strong, rows(1), 0.0, 2.5, "start"), 0)
+        optimise_landing(strong, draw_flights(strong, rows(1), HEALTHY), 0)
 
 
 def test_a_solution_that_does_not_land_is_refused(monkeypatch):
     monkeypatch.setattr(optimum, "TOUCHDOWN", np.array([0.0, 0.0, -1e-7, 0.0, 0.0, -0.5]))
     with pytest.raises(NoOptimum, match="^landing: the replay of a solution of [^\n]* m from the pad with 0.5 m/s$"):
-        optimise_landing(MARS, draw_flights(MARS, rows(1), 0.0, 2.5, "start"))
+        optimise_landing(MARS, draw_flights(MARS, rows(1), HEALTHY))
 
 
 def test_an_unknown_option_is_refused():

@@ -175,5 +175,5 @@ def test_a_lander_of_your_own_trains_with_the_failures_of_its_table(monkeypatch)
     args = script.Args(env_id="Own-v0", **script.recipe(script.Args(env_id="Own-v0")))
     batch = LanderVectorEnv(own, num_envs=8, **{name: getattr(args, name) for name in script.ENV_OPTIONS})
     batch.reset(options={"training": script.curriculum(args, 0.5)})
-    failure = batch.setting("failure_probability"), batch.setting("failure_size")
-    assert (*failure, batch.longest_flight) == (0.3, 1.5, 80.0)
+    failure = batch.failure
+    assert (failure.probability, failure.sizes, batch.longest_flight) == (0.3, (1.5, 1.5), 80.0)
