@@ -49,7 +49,10 @@ def energy_optimal_acceleration(r, v, seconds) -> np.ndarray:
 
 
 def arriving_acceleration(r, v, r_end, v_end, seconds) -> np.ndarray:
-    """The same to r_end and v_end (3,) in `seconds` (n, 1): in axes that arrive there, moving with v_end."""
+    """The acceleration (n, 3) now, with gravity, that takes r and v (n, 3) to r_end and v_end (3,) in `seconds` (n, 1).
+
+    It is the energy-optimal one in axes that move with v_end and are at r_end at that time.
+    """
     return energy_optimal_acceleration(r - r_end + v_end * seconds, v - v_end, seconds[:, 0])
 
 
@@ -216,9 +219,9 @@ class Replanned:
         sinks = np.maximum(-v[:, 2:], SLOWEST) - TOUCH[2]
         down = arriving_acceleration(r, v, 0.0, TOUCH, 2 * r[:, 2:] / sinks)
         acceleration = np.where(left > PERIOD / 2, acceleration, down)
-        if any(plan is None for plan in self.plans):
-            has_none = np.array([plan is None for plan in self.plans])[:, None]
-            acceleration = np.where(has_none, drdv_acceleration(self.lander, obs), acceleration)
+        is_unplanned = np.array([plan is None for plan in self.plans])
+        if is_unplanned.any():
+            acceleration[is_unplanned] = drdv_acceleration(self.lander, obs[is_unplanned])
         return self.estimate.command(acceleration) / self.lander.greatest_thrust
 
     def _begin(self, n: int):

@@ -168,9 +168,9 @@ def draw_flights(lander: Lander, draw: np.ndarray, failure: Failure, start_sprea
     """The flights of draws (n, 13). `start_spread` widens the box of the starts, but not its heights and sink rates.
 
     A flight has a failure if the draw's "failure" is below the probability. The failure weakens the thrust along x, if
-    "axis" is below 0.5, or along y, and the thrust along z. A number that has decided this is uniform again within what
-    it has chosen. This second number chooses a size between the least and the greatest: that of "failure" the vertical
-    one, that of "axis" the lateral one.
+    "axis" is below 0.5, or along y, and the thrust along z. In the failed flights "failure" / probability is uniform
+    from 0 to 1, and so is "axis" in its half, stretched to the whole. They choose the sizes between the least and the
+    greatest: "failure" that along z, "axis" the other.
     """
     start = np.array(lander.start)
     spread = np.array(lander.spread)

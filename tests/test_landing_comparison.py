@@ -44,6 +44,23 @@ def test_a_law_is_compared_where_the_optimum_is_known():
     assert (row["eval_starts"], row["reference_starts"]) == (6, 2)
 
 
+def test_the_harder_failures_are_those_that_the_notebooks_print(monkeypatch):
+    flown = []
+
+    def note(env_id, failure, *rest):
+        flown.append(failure)
+        return {}
+
+    monkeypatch.setattr(comparison, "fly_laws", note)
+    rows = comparison.stress_rows(ID, {}, FAILURE, 0, 3, 2)
+    assert [(f["failure_size"], f["failure_vertical"], f["failure_probability"]) for f in flown] == [
+        (3.0, 1.5, 0.5),
+        (2.5, 1.75, 0.5),
+    ]
+    assert rows["3 / 1.5: GRU, 60 steps, printed"]["position_error_max_m"] == 7.6
+    assert rows["2.5 / 1.75: GRU, 60 steps, printed"]["speed_max_m_s"] == 31.9
+
+
 @pytest.fixture
 def folder(tmp_path):
     (tmp_path / "eval.json").write_text(json.dumps({"env_id": ID, **FAILURE}))

@@ -130,11 +130,14 @@ def test_the_curriculum_of_our_recipe():
 def test_the_script_trains_evaluates_and_publishes(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     tiny = ["--embed-dim=8", "--num-heads=2", "--num-blocks=1", "--memory-length=4", "--mlp-dim=8", "--hidden-dim=8"]
-    argv = ["--total-updates=1", "--num-envs=4", "--eval-starts=10", "--failure-time=random"]
+    argv = ["--total-updates=1", "--num-envs=4", "--eval-starts=10", "--failure-time=random", "--failure-vertical=1.2"]
     script.main([*tiny, *argv])
     (run,) = (tmp_path / "runs").iterdir()
     metrics, arrays = read_evaluation(run)
     assert metrics["failure_time"] == "random" and metrics["decision_s"] == 0.4
+    assert metrics["failure_vertical"] == 1.2
+    failed = arrays["effectiveness"][..., 2]
+    assert np.nanmin(failed) == 1 / 1.2
     assert arrays["u"].shape[::2] == (10, 3) and float(arrays["decision_s"]) == 0.2
     script.main(
         [f"--checkpoint={run / 'agent.safetensors'}", "--eval-only", "--eval-starts=10", "--eval-json=again.json"]
