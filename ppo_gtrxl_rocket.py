@@ -44,7 +44,7 @@ from common.schedule import Schedule
 from cuda_graphs import speed_up
 from envs import ROCKETS
 from rocket.failure import FAILURE_TIMES
-from rocket.policy_constants import DIFFERENCES, WIDE_DIFFERENCES, policy_constants
+from rocket.policy_constants import DIFFERENCES, FAR, NEAR, policy_constants
 from rocket.rewards import TERMINAL_SCALE, mass_rewards
 
 
@@ -121,6 +121,8 @@ class Args:
     # ours: off here, on in RECIPES
     lr_times_std: bool = False  # the learning rate is --learning-rate times the policy's std
     flights_per_start: flags.CountSchedule = Schedule(1)  # flights of each start or draw, compared with one another
+    # the differences from the nominal flight also pass the blocks by (`entering`)
+    direct_differences: Annotated[bool, flags.Policy.SUGGESTS] = False
     guidance: bool = False  # pay R_guidance, which the paper names and we give a formula (rocket/rewards.py)
     # factor on `mass_rewards`, where the engine cuts off at the target's energy
     mass_weight: flags.WeightSchedule = Schedule(0.0)
@@ -174,8 +176,10 @@ DISPERSED = {  # replaces values of the recipe above; training begins with a pol
     "mass_weight": "0.1:0 0.2:0.2 0.5:0.2 0.85:0",
     "weight_average": 0.998,
 }
-FAILING = {  # replaces values of DISPERSED; rare failures are forgotten if training moves the policy far
-    "log_std": "0:-4.5 1:-6.5",
+FAILING = {  # replaces values of DISPERSED; training begins with a policy of healthy flights that differ
+    "direct_differences": True,  # a failure makes them large, and the blocks go on wrongly beyond what they have seen
+    "log_std": "0:-4.5 1:-6.5",  # with larger noise the direct path learns to burn more
+    "mass_weight": "0.1:0 0.2:1 0.5:1 0.85:0",  # so that failed flights burn less
 }
 RECIPES = {env_id: CUTOFF if mission.cutoff else FIXED for env_id, mission in ROCKETS.items()}
 FIRST_POLICY = {  # the policy with which a dispersed training begins, by environment id
@@ -281,8 +285,8 @@ def features(agent, obs):
     - the share of the time that is left, log mass, the phase one-hot
     - the orbit's error, and tanh(10 error), which shows small errors
     - the draw, with --observe-draw
-    - the flight's difference from the nominal flight, in units of `differences`, clipped at 10 because tanh would
-      flatten it; zeros until the agent has a nominal flight
+    - the flight's difference from the nominal flight, in units of `differences`, clipped at NEAR (at FAR if there is a
+      direct path) because tanh would flatten it; zeros until the agent has a nominal flight
 
     The paper's policy sees the environment's observation alone: r and v in ECI, m, t_norm and the phase.
     """
@@ -291,7 +295,8 @@ def features(agent, obs):
     one_hot = ((phase - agent.phases).abs() < 1e-3).to(obs.dtype)  # phase: 0 to 1 (the paper's 0 to 3)
 
     differs = (compared(m) - nominal_at(agent, phase, m.energy)) / agent.differences
-    differs = torch.where(has_nominal_flight(agent), differs.clamp(-10, 10), 0.0)
+    limit = FAR if agent.direct is not None else NEAR
+    differs = torch.where(has_nominal_flight(agent), differs.clamp(-limit, limit), 0.0)
 
     seen = [m.r, m.v, m.altitude, m.climb, m.out_of_plane, m.speed, time_left, m.log_mass, one_hot]
     seen += [m.error, (10 * m.error).tanh()]
@@ -403,36 +408,47 @@ def has_nominal_flight(agent):
     return agent.nominal_flight[0, 1] < 0
 
 
+def entering(agent, seen):
+    """The first block's input (..., d), and what is added to the last block's output: (..., d), or 0. Ours.
+
+    `seen` (..., inputs) are the `features`. With --direct-differences a linear map of the differences from the nominal
+    flight passes the blocks by. A block has layer norms, and gates that depend on its input. It answers to a difference
+    ten times as large as those of training with up to three times the tenfold answer (docs/archive.md). So the blocks
+    see large differences only up to NEAR, and the linear map goes on in proportion.
+    """
+    if agent.direct is None:
+        return agent.encoder(seen), 0.0
+    differs = seen[..., -len(DIFFERENCES) :]
+    near = torch.cat([seen[..., : -len(DIFFERENCES)], differs.clamp(-NEAR, NEAR)], dim=-1)
+    return agent.encoder(near), agent.direct(differs)
+
+
+def with_direct_path(saved, args):
+    """What a checkpoint holds, with a direct path of zeros where --direct-differences is new to its policy.
+
+    So the policy flies on as before within NEAR.
+    """
+    if saved is None or not args.direct_differences or "direct.weight" in saved["tensors"]:
+        return saved
+    zeros = np.zeros((args.embed_dim, len(DIFFERENCES)), dtype=np.float32)
+    return {**saved, "tensors": {**saved["tensors"], "direct.weight": zeros}}
+
+
 @torch.no_grad()
 def show_differences(agent, args, env_options):
     """Before a dispersed training, let its first policy fly the nominal flight, and store this flight in the agent.
 
     The draw and the differences are new inputs to that policy. Their weights are set to 0, so the policy flies as
-    before at first. A training with failures begins with `widen_differences`.
+    before at first.
     """
     begins = has_draws(args) and args.checkpoint is not None and args.resume is None and not args.eval_only
-    if not begins:
-        return
-    if args.failure:
-        widen_differences(agent)
-    if has_nominal_flight(agent):  # a policy of a dispersed training has its nominal flight already
+    if not begins or has_nominal_flight(agent):  # a policy of a dispersed training has its nominal flight already
         return
     exact = {**env_options, "dispersion": 0.0, "failure": 0.0, "navigation_noise": None}
     envs = gym.make_vec(args.env_id, num_envs=1, **exact)
     fly_nominal(agent, agent.make_policy(envs.episode_steps), envs)
     draw = envs.single_observation_space.shape[0] - OBSERVED
     agent.encoder[0].weight[:, -(draw + len(DIFFERENCES)) :] = 0.0
-
-
-def widen_differences(agent):
-    """Let a policy see ten times as large differences of the orbit, and twice as large ones of the angle.
-
-    The units of the differences grow, and the weights of these inputs grow by the same factor. So the policy flies as
-    before within the narrow clip, and its answer goes on linearly beyond it.
-    """
-    wide = agent.differences.new_tensor(WIDE_DIFFERENCES)
-    agent.encoder[0].weight[:, -len(DIFFERENCES) :] *= wide / agent.differences
-    agent.differences.copy_(wide)
 
 
 def fly_nominal(agent, policy, envs):
@@ -614,6 +630,9 @@ class Agent(nn.Module):
         self.num_blocks = args.num_blocks
         self.memory_length = args.memory_length
         self.embed_dim = d
+        self.direct = None  # this problem
+        if args.direct_differences:  # this problem
+            self.direct = linear(len(DIFFERENCES), d, gain=0.0, bias=None)  # this problem
 
         # saved with the weights; `features` and `mean_action` read them as agent.<name>
         buffers = {**constants(args.env_id), "action_scale": envs.single_action_space.high.tolist()}
@@ -640,10 +659,10 @@ class Agent(nn.Module):
 
     def encode(self, obs, memory):
         """Whole episodes in parallel (training): obs (N, T, obs), memory (blocks, N, L, d) -> hidden (N, T, d)."""
-        x = self.encoder(features(self, obs))
+        x, direct = entering(self, features(self, obs))  # this problem
         for block, block_memory in zip(self.blocks, memory):
             x = block(x, block.attention(x, block_memory))
-        return x
+        return x + direct  # this problem
 
     @torch.no_grad()
     def start_cache(self, memory, steps):
@@ -652,10 +671,10 @@ class Agent(nn.Module):
 
     def encode_step(self, obs, cache, t):
         """Step t of the same episodes (rollout): obs (N, obs) -> hidden (N, d). The cost does not grow with t."""
-        x = self.encoder(features(self, obs))
+        x, direct = entering(self, features(self, obs))  # this problem
         for block, block_cache in zip(self.blocks, cache):
             x = block(x, block.attention.step(x, block_cache, t))
-        return x
+        return x + direct  # this problem
 
     def get_mean_action(self, hidden):
         """The policy without its noise, which evaluation flies: actions (..., actions) of hidden (..., d)."""
@@ -1000,6 +1019,7 @@ def main(argv):
     env_options = {name: getattr(args, name) for name in ENV_OPTIONS} | FIXED_OPTIONS
     envs = runs.make_envs(args, env_options)
     agent = Agent(args, envs).to(device)  # line 1
+    saved = with_direct_path(saved, args)  # this problem
     runs.load_checkpoint(agent, args, saved)
     show_differences(agent, args, env_options)  # this problem
     average = AveragedModel(agent, multi_avg_fn=get_ema_multi_avg_fn(args.weight_average))

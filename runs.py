@@ -193,6 +193,9 @@ def resolve(typed, script):
             saved, of_policy = first_saved, of_first
     if saved is not None:
         saved["keeps_log_std"] = "log_std" not in typed  # a learned log-std goes on from the file's
+    if not args.eval_only:  # what a policy only suggests, the recipe of its further training may change
+        suggested = [name for name, mark in facts(script.Args, Policy).items() if mark is Policy.SUGGESTS]
+        of_policy |= {name: of_recipe[name] for name in suggested if name in of_recipe}
     return script.Args(**{**of_recipe, **of_policy}), saved
 
 
@@ -209,12 +212,14 @@ def path_of_policy(path):
 
 
 def younger(script):
-    """The arguments that an older file need not have: options of environments, and flags that are off with None.
+    """The arguments that an older file need not have: options of environments, and flags that are off.
 
     Their defaults are what was trained before the flags existed.
     """
     return {
-        name: value for name, value in plain_args(script.Args()).items() if value is None or name in script.ENV_OPTIONS
+        name: value
+        for name, value in plain_args(script.Args()).items()
+        if value is None or value is False or name in script.ENV_OPTIONS
     }
 
 

@@ -32,7 +32,7 @@ class Policy(Enum):
     """What the file of a policy says of a flag. It says nothing of a flag without this mark."""
 
     FIXES = "the file decides, and another value on the command line is refused"
-    SUGGESTS = "the file decides unless the flag is typed"
+    SUGGESTS = "the file decides unless the flag is typed, or the recipe of a further training names it"
 
 
 Recipe = Annotated[str, Words(("ours", "paper"))]

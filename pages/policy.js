@@ -4,6 +4,9 @@
 // in float64 from their float32 weights. Weights are Float64Arrays. What is computed are plain arrays: engines make them
 // several times faster. It needs numbers.js.
 
+const NEAR = 10; // units of a difference from the nominal flight up to which the blocks see it
+const FAR = 100; // up to which a direct path sees it, as in `entering` of the rocket's script
+
 // W x + b; weight {shape: [outputs, inputs], values}, bias {values} or none.
 function linear(weight, bias, x) {
   const [outputs, inputs] = weight.shape;
@@ -136,13 +139,18 @@ class Network {
 
   // The policy head's output for the features of the next step.
   step(features) {
-    const { encoder, blocks, actor } = this.constants;
-    let x = gelu(linear(encoder[0].weight, encoder[0].bias, features));
+    const { encoder, blocks, actor, direct } = this.constants;
+    const first = direct ? features.length - direct.weight.shape[1] : features.length; // from here on they pass by, too
+    const seen = features.map((value, k) => (k < first ? value : clamp(value, -NEAR, NEAR)));
+    let x = gelu(linear(encoder[0].weight, encoder[0].bias, seen));
     (blocks || []).forEach((block, k) => {
       const { attended, past } = attend(block.attention, x, this.pasts[k], this.heads);
       this.pasts[k] = past;
       x = blockStep(block, x, attended);
     });
+    if (direct) {
+      x = added(x, linear(direct.weight, null, features.slice(first)));
+    }
     const hidden = gelu(linear(actor[0].weight, actor[0].bias, x));
     return linear(actor[2].weight, actor[2].bias, hidden);
   }

@@ -79,7 +79,7 @@ function rocketFeatures(constants, observation) {
   ];
 }
 
-// What the flight differs by from the nominal one at the same phase and energy, in its own units and clipped at 10;
+// What the flight differs by from the nominal one at the same phase and energy, in its own units and clipped;
 // zeros where the policy has no nominal flight.
 function differencesOf(constants, motion, phase) {
   const { nominal_flight, differences } = constants;
@@ -88,7 +88,8 @@ function differencesOf(constants, motion, phase) {
   }
   const nominal = nominalAt(constants, phase, motion.energy);
   const compared = [...motion.error, motion.logMass, motion.angle];
-  return compared.map((value, k) => clamp((value - nominal[k]) / differences.values[k], -10, 10));
+  const limit = constants.direct ? FAR : NEAR;
+  return compared.map((value, k) => clamp((value - nominal[k]) / differences.values[k], -limit, limit));
 }
 
 // `nominal_at` of the script: rows of burn, energy and what is compared; linear between two rows of a burn.

@@ -10,9 +10,8 @@ from rocket.vehicle import Rocket
 # Flights at dispersion 1 differ by about these sizes at the same energy of the same burn. The numbers are the three
 # components of (h - h_T) / |h_T|, the three of e - e_T, the logarithm of the observed mass, and the angle flown in rad.
 DIFFERENCES = [5e-5, 5e-5, 5e-5, 1e-4, 3e-4, 2e-5, 0.01, 0.004]
-# Flights that lose thrust differ more: a quarter less thrust of the last stage moves the orbit by up to 100 such sizes,
-# and a quarter less of stage 1 the angle by up to 16. The mass differs by more, but to see more of it does not help.
-WIDE_DIFFERENCES = [10 * size for size in DIFFERENCES[:6]] + [DIFFERENCES[6], 2 * DIFFERENCES[7]]
+NEAR = 10.0  # such sizes, up to which a network's blocks see a difference; healthy flights hardly go beyond
+FAR = 100.0  # up to which its direct path does: so far a quarter less thrust of the last stage moves the orbit
 
 
 def policy_constants(rocket: Rocket) -> dict:
@@ -24,7 +23,7 @@ def policy_constants(rocket: Rocket) -> dict:
     - `phases`: the observed phase of each burn
     - `nominal_flight` (steps + 1, 10): rows of burn, specific energy and the 8 numbers by which flights are compared; a
       dispersed training fills it
-    - `differences` (8,): the sizes of those numbers' differences; a training with failures makes them wide
+    - `differences` (8,): the sizes of those numbers' differences
     """
     axes = target_axes(rocket)
     steps = int(np.ceil(rocket.end_time / rocket.dt))

@@ -1,6 +1,5 @@
 """Dispersed flights beside the nominal one: what `show_differences` keeps of it, how it is looked up, what is seen."""
 
-import copy
 from dataclasses import replace
 
 import gymnasium as gym
@@ -144,30 +143,39 @@ def test_what_comes_into_sight_changes_nothing_at_first():
     assert (agent.encoder[0].weight[:, -8:] == 0.5).all() and torch.equal(agent.nominal_flight, kept)
 
 
-def test_before_a_training_with_failures_larger_differences_come_into_sight(flown):
-    """Of the orbit ten times, of the angle twice. A policy flies on as before where the narrow ones were in sight.
+def test_a_direct_path_sees_large_differences_in_proportion(flown):
+    """Beyond ten units the blocks receive the same, and what is added behind them grows in proportion, up to 100."""
+    agent, _, _ = make_agent(failure=0.25, direct_differences=True)
+    agent.nominal_flight.copy_(flown[0].nominal_flight)
+    torch.nn.init.normal_(agent.direct.weight)
+    obs = torch.as_tensor(fly(climb, 4, dispersion=1.0)[0][60])
 
-    A second time nothing changes.
-    """
-    agent = copy.deepcopy(flown[0])
-    _, args, env_options = make_agent(failure=0.25)
-    seen = torch.as_tensor(fly(climb, 8, dispersion=1.0)[0]).flatten(0, 1)
-    narrow = script.features(agent, seen)
-    before = agent.encoder(narrow)
-    script.show_differences(agent, args, env_options)
-    wide = script.features(agent, seen)
+    def entering(units):
+        seen = script.features(agent, obs)
+        seen[:, -8:] = units * torch.tensor([1.0, -1.0] * 4).double()
+        return script.entering(agent, seen)
 
-    as_before = (narrow[:, -8:].abs() < 10).all(dim=-1)
-    torch.testing.assert_close(agent.encoder(wide)[as_before], before[as_before], rtol=0, atol=1e-6)
-    assert as_before.any() and not as_before.all()
-    torch.testing.assert_close(wide[:, [*range(29), 35]], narrow[:, [*range(29), 35]], rtol=1e-6, atol=0)
-    in_sight = narrow[:, 36].abs() < 10
-    torch.testing.assert_close(2 * wide[in_sight, 36], narrow[in_sight, 36], rtol=1e-5, atol=0)
-    assert (10 * wide[:, -8:-2]).abs().max() > 20  # no longer clipped at 10 of the narrow sizes
-    once = copy.deepcopy(agent.state_dict())
-    script.show_differences(agent, args, env_options)
-    for name, tensor in agent.state_dict().items():
-        assert torch.equal(tensor, once[name]), name
+    ten, twenty = entering(10.0), entering(20.0)
+    assert torch.equal(ten[0], twenty[0]) and not torch.equal(ten[0], entering(5.0)[0])
+    torch.testing.assert_close(2 * ten[1], twenty[1])
+    agent.differences /= 1e6
+    differs = script.features(agent, obs)[:, -8:]
+    assert differs.abs().max() == 100.0
+
+
+def test_a_direct_path_changes_nothing_at_first(flown):
+    """A policy without one flies on as before, and what the file lacks is the path alone."""
+    before = flown[0]
+    saved = {"tensors": {name: tensor.numpy() for name, tensor in before.state_dict().items()}}
+    agent, args, _ = make_agent(failure=0.25, direct_differences=True)
+    filled = script.with_direct_path(saved, args)["tensors"]
+    assert filled.keys() - saved["tensors"].keys() == {"direct.weight"} and "direct.weight" not in saved["tensors"]
+    agent.load_state_dict({name: torch.as_tensor(array) for name, array in filled.items()})
+    obs = torch.as_tensor(fly(climb, 4, dispersion=1.0)[0][:60]).transpose(0, 1)
+    memory = agent.new_memory(4, 0.0)
+    assert torch.equal(agent.encode(obs, memory), before.encode(obs, memory))
+    assert script.with_direct_path({"tensors": filled}, args)["tensors"] is filled
+    assert script.with_direct_path(saved, make_agent()[1]) is saved
 
 
 @pytest.mark.parametrize(

@@ -83,7 +83,7 @@ def assert_ends_alike(flight, error_norm, y, m=1.0):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("result", ["rocket_dispersed", "rocket_fixed"])
+@pytest.mark.parametrize("result", ["rocket_failures", "rocket_fixed"])
 def test_with_all_sliders_at_zero_the_flight_is_pythons(result):
     metrics, arrays = read_evaluation(ROOT / "results" / result)
     flight = flights_of(result)["policy"]
@@ -94,7 +94,7 @@ def test_with_all_sliders_at_zero_the_flight_is_pythons(result):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("result", ["rocket_dispersed", "two_stage_leo"])
+@pytest.mark.parametrize("result", ["rocket_failures", "two_stage_leo"])
 def test_another_vehicle_flies_as_pythons(result):
     """All sliders moved: the policy by torch, the laws by rocket/guidance.py, on the same draw."""
     agent, args, options = load(ROOT / "results" / result / "agent.safetensors")
