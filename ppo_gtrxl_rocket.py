@@ -177,7 +177,7 @@ DISPERSED = {  # replaces values of the recipe above; training begins with a pol
     "weight_average": 0.998,
 }
 FAILING = {  # replaces values of DISPERSED; training begins with a policy of healthy flights that differ
-    "total_updates": 225,
+    "total_updates": 225,  # the direct path begins at zero
     "direct_differences": True,  # a failure makes them large, and the blocks go on wrongly beyond what they have seen
     "mass_weight": "0.1:0 0.2:1 0.5:1 0.85:0",  # so that failed flights burn less
 }
