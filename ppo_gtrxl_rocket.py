@@ -426,9 +426,9 @@ def entering(agent, seen):
 def with_direct_path(saved, args):
     """What a checkpoint holds, with a direct path of zeros where --direct-differences is new to its policy.
 
-    So the policy flies on as before within NEAR.
+    So the policy flies on as before within NEAR. A training that is resumed has its own path.
     """
-    if saved is None or not args.direct_differences or "direct.weight" in saved["tensors"]:
+    if saved is None or args.resume or not args.direct_differences or "direct.weight" in saved["tensors"]:
         return saved
     zeros = np.zeros((args.embed_dim, len(DIFFERENCES)), dtype=np.float32)
     return {**saved, "tensors": {**saved["tensors"], "direct.weight": zeros}}
