@@ -121,7 +121,7 @@ class Args:
     # ours: off here, on in RECIPES
     lr_times_std: bool = False  # the learning rate is --learning-rate times the policy's std
     flights_per_start: flags.CountSchedule = Schedule(1)  # flights of each start or draw, compared with one another
-    # the differences from the nominal flight also pass the blocks by (`entering`)
+    # the differences from the nominal flight also pass the blocks by (`past_the_blocks`)
     direct_differences: Annotated[bool, flags.Policy.SUGGESTS] = False
     guidance: bool = False  # pay R_guidance, which the paper names and we give a formula (rocket/rewards.py)
     # factor on `mass_rewards`, where the engine cuts off at the target's energy
@@ -285,8 +285,7 @@ def features(agent, obs):
     - the share of the time that is left, log mass, the phase one-hot
     - the orbit's error, and tanh(10 error), which shows small errors
     - the draw, with --observe-draw
-    - the flight's difference from the nominal flight, in units of `differences`, clipped at NEAR (at FAR if there is a
-      direct path) because tanh would flatten it; zeros until the agent has a nominal flight
+    - the flight's `differences` from the nominal flight, clipped at NEAR because tanh would flatten them
 
     The paper's policy sees the environment's observation alone: r and v in ECI, m, t_norm and the phase.
     """
@@ -294,9 +293,7 @@ def features(agent, obs):
     time_left, phase, draw = obs[..., 7:8], obs[..., 8:9], obs[..., OBSERVED:]
     one_hot = ((phase - agent.phases).abs() < 1e-3).to(obs.dtype)  # phase: 0 to 1 (the paper's 0 to 3)
 
-    differs = (compared(m) - nominal_at(agent, phase, m.energy)) / agent.differences
-    limit = FAR if agent.direct is not None else NEAR
-    differs = torch.where(has_nominal_flight(agent), differs.clamp(-limit, limit), 0.0)
+    differs = differences(agent, m, phase).clamp(-NEAR, NEAR)
 
     seen = [m.r, m.v, m.altitude, m.climb, m.out_of_plane, m.speed, time_left, m.log_mass, one_hot]
     seen += [m.error, (10 * m.error).tanh()]
@@ -408,19 +405,26 @@ def has_nominal_flight(agent):
     return agent.nominal_flight[0, 1] < 0
 
 
-def entering(agent, seen):
-    """The first block's input (..., d), and what is added to the last block's output: (..., d), or 0. Ours.
+def differences(agent, m, phase):
+    """How a flight's `Motion` differs from the nominal flight (..., 8), in units of agent.differences. Ours.
 
-    `seen` (..., inputs) are the `features`. With --direct-differences a linear map of the differences from the nominal
-    flight passes the blocks by. A block has layer norms, and gates that depend on its input. It answers to a difference
-    ten times as large as those of training with up to three times the tenfold answer (docs/archive.md). So the blocks
-    see large differences only up to NEAR, and the linear map goes on in proportion.
+    The nominal flight is taken at the same phase (..., 1) and energy. Until the agent has one, the differences are 0.
+    """
+    differs = (compared(m) - nominal_at(agent, phase, m.energy)) / agent.differences
+    return torch.where(has_nominal_flight(agent), differs, 0.0)
+
+
+def past_the_blocks(agent, obs):
+    """What is added to the last block's output: (..., d) of observations (..., 9 or more), or 0. Ours.
+
+    With --direct-differences it is a linear map of the `differences`, up to FAR. A block has layer norms, and gates
+    that depend on its input. It answers to a difference ten times as large as those of training with up to three times
+    the tenfold answer (docs/archive.md). So the blocks see differences only up to NEAR, and the linear map goes on in
+    proportion.
     """
     if agent.direct is None:
-        return agent.encoder(seen), 0.0
-    differs = seen[..., -len(DIFFERENCES) :]
-    near = torch.cat([seen[..., : -len(DIFFERENCES)], differs.clamp(-NEAR, NEAR)], dim=-1)
-    return agent.encoder(near), agent.direct(differs)
+        return 0.0
+    return agent.direct(differences(agent, motion(agent, obs), obs[..., 8:9]).clamp(-FAR, FAR))
 
 
 def with_direct_path(saved, args):
@@ -659,10 +663,11 @@ class Agent(nn.Module):
 
     def encode(self, obs, memory):
         """Whole episodes in parallel (training): obs (N, T, obs), memory (blocks, N, L, d) -> hidden (N, T, d)."""
-        x, direct = entering(self, features(self, obs))  # this problem
+        x = self.encoder(features(self, obs))
         for block, block_memory in zip(self.blocks, memory):
             x = block(x, block.attention(x, block_memory))
-        return x + direct  # this problem
+        x = x + past_the_blocks(self, obs)  # this problem
+        return x
 
     @torch.no_grad()
     def start_cache(self, memory, steps):
@@ -671,10 +676,11 @@ class Agent(nn.Module):
 
     def encode_step(self, obs, cache, t):
         """Step t of the same episodes (rollout): obs (N, obs) -> hidden (N, d). The cost does not grow with t."""
-        x, direct = entering(self, features(self, obs))  # this problem
+        x = self.encoder(features(self, obs))
         for block, block_cache in zip(self.blocks, cache):
             x = block(x, block.attention.step(x, block_cache, t))
-        return x + direct  # this problem
+        x = x + past_the_blocks(self, obs)  # this problem
+        return x
 
     def get_mean_action(self, hidden):
         """The policy without its noise, which evaluation flies: actions (..., actions) of hidden (..., d)."""

@@ -213,15 +213,15 @@ def directions(agent, physics: Physics, y, shown, memories: list):
     As `Agent.encode_step`, but nothing is written into a cache, which autograd could not follow. Each block's entry of
     `memories` is replaced: the keys and values of the last L steps, and two constants (`start_memories`).
     """
-    seen = ppo_gtrxl_rocket.features(agent, torch.cat([y[..., :6], shown], dim=-1))
-    x, direct = ppo_gtrxl_rocket.entering(agent, seen)
+    obs = torch.cat([y[..., :6], shown], dim=-1)
+    x = agent.encoder(ppo_gtrxl_rocket.features(agent, obs))
     for k, block in enumerate(agent.blocks):
         past, projections, R = memories[k]
         q, kv = block.attention.project(x, projections)
         window = torch.cat([past, kv], dim=3)
         x = block(x, block.attention.attend(q, window, R))
         memories[k] = window[:, :, :, 1:], projections, R
-    return physics.to_eci(agent.get_mean_action(x + direct), y)
+    return physics.to_eci(agent.get_mean_action(x + ppo_gtrxl_rocket.past_the_blocks(agent, obs)), y)
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -47,13 +47,13 @@ class PolicyStep(nn.Module):
         super().__init__()
         self.agent = agent
         self.features = script.features
-        self.entering = getattr(script, "entering", all_through_the_blocks)
+        self.direct = script.past_the_blocks if getattr(agent, "direct", None) is not None else None
         self.in_float64 = copy.deepcopy(agent).double()  # the features read its buffers
         memory = agent.new_memory(1, noise=0.0)
         self.constants = [constants for _, *constants in agent.start_cache(memory, steps=0)]
 
     def forward(self, observation, memory=None):
-        x, direct = self.entering(self.agent, self.features(self.in_float64, observation).float())
+        x = self.agent.encoder(self.features(self.in_float64, observation).float())
         next_memory = []
         for k, (block, (projections, R)) in enumerate(zip(self.agent.blocks, self.constants)):
             q, window = block.attention.project(x, projections)
@@ -61,13 +61,10 @@ class PolicyStep(nn.Module):
                 window = torch.cat([memory[k], window], dim=3)  # (2, N, H, L + 1, dk)
             x = block(x, block.attention.attend(q, window, R))
             next_memory.append(window[:, :, :, 1:])
-        action = self.agent.get_mean_action(x + direct)
+        if self.direct is not None:
+            x = x + self.direct(self.in_float64, observation).float()
+        action = self.agent.get_mean_action(x)
         return action if memory is None else (action, torch.stack(next_memory))
-
-
-def all_through_the_blocks(agent, seen):
-    """As `entering` of the rocket's script, for policies without features that pass the blocks by."""
-    return agent.encoder(seen), 0.0
 
 
 # ---------------------------------------------------------------------------------------------------------------------

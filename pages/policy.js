@@ -5,7 +5,7 @@
 // several times faster. It needs numbers.js.
 
 const NEAR = 10; // units of a difference from the nominal flight up to which the blocks see it
-const FAR = 100; // up to which a direct path sees it, as in `entering` of the rocket's script
+const FAR = 100; // up to which a direct path sees it, as in `past_the_blocks` of the rocket's script
 
 // W x + b; weight {shape: [outputs, inputs], values}, bias {values} or none.
 function linear(weight, bias, x) {

@@ -149,18 +149,19 @@ def test_a_direct_path_sees_large_differences_in_proportion(flown):
     agent.nominal_flight.copy_(flown[0].nominal_flight)
     torch.nn.init.normal_(agent.direct.weight)
     obs = torch.as_tensor(fly(climb, 4, dispersion=1.0)[0][60])
+    units = agent.differences.clone()
 
-    def entering(units):
-        seen = script.features(agent, obs)
-        seen[:, -8:] = units * torch.tensor([1.0, -1.0] * 4).double()
-        return script.entering(agent, seen)
+    def at(largest):
+        agent.differences.copy_(units)
+        now = script.differences(agent, script.motion(agent, obs), obs[:, 8:9])
+        agent.differences.copy_(units * now.abs().max(dim=0).values / largest)
+        return script.features(agent, obs)[:, -8:], script.past_the_blocks(agent, obs)
 
-    ten, twenty = entering(10.0), entering(20.0)
-    assert torch.equal(ten[0], twenty[0]) and not torch.equal(ten[0], entering(5.0)[0])
-    torch.testing.assert_close(2 * ten[1], twenty[1])
-    agent.differences /= 1e6
-    differs = script.features(agent, obs)[:, -8:]
-    assert differs.abs().max() == 100.0
+    five, ten, forty, eighty, far, farther = (at(largest) for largest in (5.0, 10.0, 40.0, 80.0, 1e6, 1e9))
+    assert five[0].abs().max() < 10 and eighty[0].abs().max() == 10.0
+    torch.testing.assert_close(2 * five[1], ten[1])
+    torch.testing.assert_close(2 * forty[1], eighty[1])
+    torch.testing.assert_close(far[1], farther[1])
 
 
 def test_a_direct_path_changes_nothing_at_first(flown):

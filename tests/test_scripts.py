@@ -80,7 +80,13 @@ def shared(text):
 # by script, the lines of the shared sections that only it has; they end with "# this problem"
 ITS_OWN = {
     "ppo_gtrxl_rocket": [
+        "self.direct = None",
+        "if args.direct_differences:",
+        "self.direct = linear(len(DIFFERENCES), d, gain=0.0, bias=None)",
+        "x = x + past_the_blocks(self, obs)",
+        "x = x + past_the_blocks(self, obs)",
         "add_rewards(args, progress, training, envs, batch, episodes)",
+        "saved = with_direct_path(saved, args)",
         "show_differences(agent, args, env_options)",
     ]
 }
@@ -216,7 +222,7 @@ def test_a_dispersed_training_begins_with_the_shipped_policy(monkeypatch, capsys
     args = dispersed()
     assert args.checkpoint == "results/rocket_cutoff/agent.safetensors" and str(args.log_std) == "0:-3.5 1:-6.5"
     failing = dispersed("--failure=0.25")
-    assert failing.checkpoint == "results/rocket_dispersed/agent.safetensors" and failing.total_updates == 150
+    assert failing.checkpoint == "results/rocket_dispersed/agent.safetensors" and failing.total_updates == 225
     anew = dispersed("--embed-dim=8")
     assert anew.checkpoint is None and anew.num_envs == 64
     assert str(anew.log_std) == ROCKET.RECIPES["RocketAscentCutoff-v0"]["log_std"]  # not that of a trained policy
