@@ -10,14 +10,18 @@ from common.files import replacing
 
 
 def read_curve(run_dir) -> dict:
-    """The curve of a run from its TensorBoard events. A resumed run repeats steps, and the last value counts."""
+    """The curve of a run from its TensorBoard events. A resumed run repeats steps, and the last written value counts.
+
+    The time decides which value is the last: the names of files of one second are not in the order of writing.
+    """
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     events = EventAccumulator(str(run_dir), size_guidance={"scalars": 0})
     events.Reload()
     curve = {}
     for tag in events.Tags()["scalars"]:
-        values = {event.step: event.value for event in events.Scalars(tag)}
+        as_written = sorted(events.Scalars(tag), key=lambda event: event.wall_time)
+        values = {event.step: event.value for event in as_written}
         steps = sorted(values)
         curve[tag] = np.array(steps), np.array([values[step] for step in steps])
     return curve

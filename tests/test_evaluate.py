@@ -338,6 +338,8 @@ def test_curve_of_a_resumed_run_keeps_the_last_value(tmp_path):
             for step in steps:
                 writer.add_scalar("losses/policy_loss", step / 3 + shift, step)
             writer.add_scalar("eval/ratio_mean", 1.0 + shift, steps[-1])
+    (resumed,) = tmp_path.glob("*.0.5")
+    resumed.rename(tmp_path / "events.out.tfevents.0")  # its name comes first
     curve = read_curve(tmp_path)
     steps, values = curve["losses/policy_loss"]
     assert steps.tolist() == [100, 200, 300, 400]
