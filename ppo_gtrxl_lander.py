@@ -78,12 +78,13 @@ class Args:
     observe_phase: flags.Observed = True  # show the time to the policy
     observe_velocity: flags.Observed = True  # show the velocity to the policy
     observe_command: flags.Observed = True  # show the last command to the policy
+    observe_acceleration: flags.Observed = False  # show the change of the velocity to the policy
     observe_draw: flags.Observed = False  # show mass, gravity and failure to the policy, which no real flight knows
     # probability of a hidden failure (None: the lander's)
     failure_probability: Annotated[flags.Share | None, flags.Policy.SUGGESTS] = None
-    # a failure divides the thrust along x or y by this (None: the lander's)
+    # a failure divides the thrust along x or y by this (None: the lander's; in training from 1 to more than that)
     failure_size: Annotated[float | None, flags.Range(1.0, 100.0), flags.Policy.SUGGESTS] = None
-    # a failure divides the thrust along z by this (None: the lander's)
+    # a failure divides the thrust along z by this (None: the lander's; in training from 1 to more than that)
     failure_vertical: Annotated[float | None, flags.Range(1.0, 100.0), flags.Policy.SUGGESTS] = None
     # when a failure strikes: at the "start" or at a "random" moment of the first 40 s
     failure_time: Annotated[str, flags.Words(FAILURE_TIMES), flags.Policy.SUGGESTS] = "start"
@@ -122,17 +123,7 @@ class Args:
     lr_times_std: bool = False  # the learning rate is --learning-rate times the policy's std
     flights_per_start: flags.CountSchedule = Schedule(1)  # flights of each draw, compared with one another
     fuel_weight: flags.WeightSchedule = Schedule(1.0)  # reward lost for 100 kg of propellant in training
-    slope_weight: flags.WeightSchedule = Schedule(2.0)  # weight of a flat last descent in training (`slope_reward`)
-    # --failure-size in training (None: the same)
-    training_failure_size: Annotated[float | None, flags.Range(1.0, 100.0)] = None
-    failure_emphasis: Annotated[float, flags.Range(0.0, 10.0)] = 1.0  # factor on --failure-probability in training
-    failed_fuel_share: flags.Share = 1.0  # share of --fuel-weight that flights with a failure pay
-    # share of the greatest thrust that training may ask for
-    thrust_share: Annotated[float, flags.Range(0.2, 1.0)] = 1.0
-    # factor on the width of the starts in training, along x and y
-    start_spread: Annotated[float, flags.Range(0.0, 2.0)] = 1.0
-    # amplitude (m/s^2) of a sideways acceleration in training that comes and goes
-    wind: Annotated[Schedule, flags.Range(0.0, 10.0)] = Schedule(0.0)
+    slope_weight: flags.WeightSchedule = Schedule(15.0)  # weight of a flat last descent in training (`slope_reward`)
     # training holds an action for this many times --decision-s
     action_hold: Annotated[Schedule, flags.Range(1.0, 500.0)] = Schedule(1.0)
     weight_average: flags.Decay = 0.0  # decay, per optimiser step, of the averaged weights used in evaluation
@@ -149,10 +140,11 @@ OURS = {
     "memory_length": 8,  # with 32 the policy learns more slowly what has failed
     "mlp_dim": 64,
     "hidden_dim": 64,
-    "total_updates": 280,
-    "num_envs": 1536,  # with 1024 flights an update, seed 1 burns more
+    "observe_acceleration": True,  # a failure shows in it at once
+    "total_updates": 180,
+    "num_envs": 1536,
     "num_minibatches": 48,
-    "flights_per_start": "0:32 0.7:32 0.7:16",  # more draws late
+    "flights_per_start": "0:16 0.7:16 0.7:8",  # more draws late
     "update_epochs": 4,
     "learning_rate": 3e-3,
     "lr_times_std": True,
@@ -163,21 +155,14 @@ OURS = {
     "target_kl": 0.03,
     "memory_noise": "0:0.01 1:0",
     "log_std": "0:-1 0.6:-2.5 1:-3.6",  # a policy that learned with less noise has less reserve
-    "fuel_weight": "0:4 0.12:4 0.25:12",
-    "slope_weight": "0:0 0.5:0 0.7:2",  # only late, because few descents are steep while the noise is large
+    "fuel_weight": "0:4 0.12:4 0.25:14 0.5:14 0.7:9",  # how much is burnt is settled by the middle
+    "slope_weight": "0:0 0.5:0 0.7:15",  # only late, because few descents are steep while the noise is large
     "weight_average": 0.998,
     "decision_s": 0.4,
     "action_hold": "0:2.5 0.6:2.5 0.8:1",  # noise that is held explores farther, and steps of 1 s are cheap
 }
 MARS = {
     **OURS,
-    "training_failure_size": 2.0,  # as published; 2.5 in evaluations
-    # the next five prepare the policy for failures that are worse than those of the training
-    "failure_emphasis": 1.2,  # six flights in ten fail
-    "failed_fuel_share": 0.3,  # they need a reserve of propellant, healthy flights need none
-    "thrust_share": 0.8,  # the rest of the thrust is a reserve
-    "start_spread": 1.9,  # less thrust sideways is as if the pad were farther and the start faster
-    "wind": 0.7,  # a policy has to notice that its motion answers less than it expects
     "longest_flight": 60.0,  # flights of learned policies take 45 s
 }
 RECIPES = {"MarsLanding-v0": MARS}
@@ -191,23 +176,28 @@ def recipe(args):
 # Problem: input and action (features and first action are ours) -------------------------------------------------------
 ENV_IDS = tuple(LANDERS)
 ENV_OPTIONS = (  # arguments of the environments
-    "observe_phase", "observe_velocity", "observe_command", "observe_draw",
+    "observe_phase", "observe_velocity", "observe_command", "observe_acceleration", "observe_draw",
     "failure_probability", "failure_size", "failure_vertical", "failure_time", "decision_s", "longest_flight",
 )  # fmt: skip
 FIXED_OPTIONS = {}  # arguments that no flag sets
 INITIAL_ACTION = [0.0, 0.0, 0.4]  # thrust straight up, a little more than the weight
-OBSERVED = 10  # numbers that every lander shows: r, v, time, command; the draw comes after them
+OBSERVED = 10  # numbers that every lander shows: r, v, time, command; acceleration and draw come after them
+DRAWN = 7  # numbers of the draw, with --observe-draw
 
 
 def constants(env_id):
     """The buffers of an environment's agents, saved with the weights; `features` reads them as agent.<name>."""
-    return {"gravity": LANDERS[env_id].gravity}
+    lander = LANDERS[env_id]
+    return {"gravity": lander.gravity, "greatest_acceleration": lander.greatest_thrust / lander.mass}
 
 
 def features(agent, obs):
     """What the encoder sees (..., inputs) of observations (..., 10 or more). Every feature is ours, in this order:
 
-    - position, velocity, time, the last command, and the draw with --observe-draw
+    - position, velocity, time, the last command
+    - with --observe-acceleration: the acceleration in units of gravity, and how far it is from the one that the last
+      command gives a lander of nominal mass and gravity without a failure
+    - with --observe-draw: the draw
     - asinh of position and velocity, which shows small ones
     - the time t = 2 h / -vz in which an even braking ends at height 0
     - asinh of three accelerations in units of gravity: the even braking vz^2 / (2 h), and r / t^2 and v / t of the
@@ -215,15 +205,20 @@ def features(agent, obs):
 
     In the code 1 m/s, 0.5 s and 1 m are added, so that nothing is divided by 0.
     """
-    r, v, time, command, draw = obs.split([3, 3, 1, 3, obs.shape[-1] - OBSERVED], dim=-1)
+    more = obs.shape[-1] - OBSERVED
+    accelerations = more % DRAWN  # 3 or none
+    r, v, time, command, acceleration, draw = obs.split([3, 3, 1, 3, accelerations, more - accelerations], dim=-1)
+    lateral, vertical = (agent.greatest_acceleration * command).split([2, 1], dim=-1)
+    expected = torch.cat([lateral, vertical - agent.gravity], dim=-1)
+    answer = acceleration - expected[..., :accelerations]
     height = r[..., 2:].clamp(min=0.0)
     fall = (-v[..., 2:]).clamp(min=0.0)
     left = 2 * height / (1 + fall) + 0.5
     braking = fall**2 / (2 * height + 1) / agent.gravity
     shift = r[..., :2] / left**2 / agent.gravity
     stop = v[..., :2] / left / agent.gravity
-    seen = [r / 1000, v / 20, time / 60, command, draw, (r / 2).asinh() / 4, v.asinh() / 3]
-    seen += [left / 30, braking.asinh(), shift.asinh(), stop.asinh()]
+    seen = [r / 1000, v / 20, time / 60, command, acceleration / agent.gravity, answer / agent.gravity, draw]
+    seen += [(r / 2).asinh() / 4, v.asinh() / 3, left / 30, braking.asinh(), shift.asinh(), stop.asinh()]
     return torch.cat(seen, dim=-1)
 
 
@@ -246,6 +241,10 @@ def describe(episodes, metrics):
 
 
 # Problem, ours: what only training changes ----------------------------------------------------------------------------
+# a training goes beyond what is flown: factors on how much more than 1 a failure divides by, and on the starts' box
+BEYOND_SIZE = 4 / 3  # on Mars from 2.5 to 3
+BEYOND_VERTICAL = 3 / 2  # on Mars from 1.5 to 1.75
+BEYOND_START = 4 / 3  # along x and y
 ALOFT_PRICE = 20.0  # hovering above the pad must cost more than any miss
 SLOPE_HEIGHT = 10.0  # m; a descent that is steep from there on has time to become steeper
 SINK_RATE = 0.8  # m/s; a policy that aims at rest on the ground can come to rest just above it and hover
@@ -258,22 +257,20 @@ def curriculum(args, progress):
     the scales fall with the noise if --log-std is a schedule, as in our recipe. They never fall below those of
     evaluations. With a learned noise, as in the paper's recipe, the reward is that of evaluations.
     """
-    of_lander = LANDERS[args.env_id].failure_probability
-    probability = of_lander if args.failure_probability is None else args.failure_probability
+    lander = LANDERS[args.env_id]
     hold = args.action_hold.at(progress) * args.decision_s / PERIOD
     training = {
         "flights_per_start": round(args.flights_per_start.at(progress)),
         "fuel_price": args.fuel_weight.at(progress),
-        "failed_fuel_share": args.failed_fuel_share,
         "slope_price": args.slope_weight.at(progress),
-        "failure_probability": min(args.failure_emphasis * probability, 1.0),
-        "thrust_share": args.thrust_share,
-        "start_spread": args.start_spread,
-        "wind": args.wind.at(progress),
+        "start_spread": BEYOND_START,
+        "edge_starts": True,
         "decision_s": max(round(hold), 1) * PERIOD,
     }
-    if args.training_failure_size is not None:
-        training["failure_sizes"] = args.training_failure_size, args.training_failure_size
+    if args.failure_size is None:
+        training["failure_sizes"] = 1.0, 1 + BEYOND_SIZE * (lander.failure_size - 1)
+    if args.failure_vertical is None:
+        training["failure_verticals"] = 1.0, 1 + BEYOND_VERTICAL * (lander.failure_vertical - 1)
     if args.log_std.has_points:
         std = math.exp(args.log_std.at(progress))
         training["position_scale"] = max(30 * std, POSITION_SCALE)

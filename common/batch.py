@@ -39,6 +39,11 @@ def checked(default, fits: Callable, allowed: str):
     return field(default=default, metadata={"fits": fits, "allowed": allowed})
 
 
+def switch() -> Any:
+    """A field of `Training` that is off unless a training turns it on."""
+    return checked(False, lambda value: isinstance(value, bool), "must be True or False")
+
+
 def is_group(size) -> bool:
     """Whether `size` is a number of flights."""
     return isinstance(size, int | np.integer) and bool(size >= 1)

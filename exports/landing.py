@@ -18,6 +18,7 @@ def interface(
     observe_phase: bool = True,
     observe_velocity: bool = True,
     observe_command: bool = True,
+    observe_acceleration: bool = False,
     observe_draw: bool = False,
     **options,
 ) -> Interface:
@@ -27,6 +28,8 @@ def interface(
     before = [f"{name}_before" for name in commands]
     units = [*["m"] * 3, *["m/s"] * 3, "s", *["1"] * 3]
     observation = list(zip(("x", "y", "z", "vx", "vy", "vz", "time", *before), units))
+    if observe_acceleration:
+        observation += [(name, "m/s^2") for name in ("ax", "ay", "az")]
     if observe_draw:
         observation += [(name, "1") for name in ("mass", "dgx", "dgy", "dgz", *EFFECTIVENESS)]
     notes = "Axes: x downrange, y crossrange, z up, the pad the origin. "

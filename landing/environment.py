@@ -12,7 +12,17 @@ import numpy as np
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
 
-from common.batch import RENDERED, BatchedEnv, SingleEnv, Training, check_options, checked, numeric, refuse_autoreset
+from common.batch import (
+    RENDERED,
+    BatchedEnv,
+    SingleEnv,
+    Training,
+    check_options,
+    checked,
+    numeric,
+    refuse_autoreset,
+    switch,
+)
 from common.errors import is_finite, refuse_unless
 from common.flying import fly_until_ended
 from landing.dynamics import Arc
@@ -56,18 +66,15 @@ class LanderTraining(Training):
     speed_scale: float = numeric(SPEED_SCALE, low=1e-12)  # m/s, scale of the speed in it
     sink_rate: float = numeric(0.0)  # m/s, the vertical speed at touchdown that the reward counts as none
     fuel_price: float = numeric(FUEL_PRICE)  # reward lost for 100 kg of propellant
-    failed_fuel_share: float = numeric(1.0, high=1.0)  # share of it that flights with a failure pay
     aloft_price: float = numeric(ALOFT_PRICE)  # reward lost where a flight ends in the air
     slope_price: float = numeric(SLOPE_PRICE)  # weight of `slope_reward`
     slope_height: float = numeric(SLOPE_HEIGHT)  # m, the height from which the slope is counted
-    thrust_share: float = numeric(1.0, high=1.0)  # share of the greatest thrust that a command may ask for
     start_spread: float = numeric(1.0)  # factor on the width of the starts along x and y
-    wind: float = numeric(0.0)  # m/s^2, the amplitude of `sway`
+    edge_starts: bool = switch()  # draw more starts near the edges of their box (`draw_flights`)
     # the least and the greatest size of a failure; None: all have the environment's
     failure_sizes: tuple[float, float] | None = checked(None, are_sizes, SIZES)
     failure_verticals: tuple[float, float] | None = checked(None, are_sizes, SIZES)
-    # the environment's arguments of the same names, where they are not None
-    failure_probability: float | None = numeric(None, high=1.0)
+    # the environment's argument of the same name, where it is not None
     decision_s: float | None = checked(None, lambda s: s is None or is_multiple(s), MULTIPLE)
 
 
@@ -79,9 +86,13 @@ class LanderVectorEnv(BatchedEnv):
     each axis by its effectiveness, and the norm is clipped once more.
 
     Observation: r (m), v (m/s), time (s), and the last clipped command in units of the action (0 at first). Mass,
-    gravity and failure are hidden. `observe_draw` shows them: mass over its nominal value, gravity's deviation over its
-    nominal value (3), and the current effectiveness of each axis (3). `observe_velocity=False`, `observe_phase=False`
-    (the time) and `observe_command=False` show zeros instead.
+    gravity and failure are hidden. `observe_velocity=False`, `observe_phase=False` (the time) and
+    `observe_command=False` show zeros instead. Two options show more, in this order:
+
+    - `observe_acceleration`: the change of v over the last decision, per second, in m/s^2 (3). At first it is that of a
+      free fall under nominal gravity.
+    - `observe_draw`: mass over its nominal value, gravity's deviation over its nominal value (3), and the current
+      effectiveness of each axis (3)
 
     A flight ends at the exact moment of touchdown, or after `longest_flight` seconds (by default the lander's). With
     `published_end` it ends as in the published code. That code looks at the altitude every 0.05 s, flies one step
@@ -110,6 +121,7 @@ class LanderVectorEnv(BatchedEnv):
         failure_vertical: float | None = None,
         failure_time: str = "start",
         observe_command: bool = True,
+        observe_acceleration: bool = False,
         observe_draw: bool = False,
         observe_velocity: bool = True,
         observe_phase: bool = True,
@@ -126,6 +138,7 @@ class LanderVectorEnv(BatchedEnv):
         self.failure_time = failure_time
         check_failure(self.failure_probability, self.failure_size, self.failure_vertical, failure_time)
         self.observe_command = observe_command
+        self.observe_acceleration = observe_acceleration
         self.observe_draw = observe_draw
         self.observe_velocity = observe_velocity
         self.observe_phase = observe_phase
@@ -140,6 +153,8 @@ class LanderVectorEnv(BatchedEnv):
         action = Box(-1.0, 1.0, (3,), dtype=np.float64)
         super().__init__(num_envs, self.episode_steps, self._observation_space(), action, render_mode, autoreset_mode)
         self.observation_scale = np.array([1000.0] * 3 + [50.0] * 3 + [self.longest_flight] + [1.0] * 3)
+        if observe_acceleration:
+            self.observation_scale = np.append(self.observation_scale, [lander.gravity] * 3)
         if observe_draw:
             self.observation_scale = np.append(self.observation_scale, np.ones(7))
         self.draw = np.zeros((num_envs, len(DRAW)))
@@ -148,6 +163,7 @@ class LanderVectorEnv(BatchedEnv):
         self.v = self.flights.v.copy()
         self.mass = self.flights.mass.copy()
         self.u = np.zeros((num_envs, 3))  # N, the clipped command of the step before
+        self.acceleration = np.zeros((3, num_envs))  # m/s^2, the mean over the step before
         self.down = np.zeros(num_envs, dtype=bool)
         self._ended = np.zeros(num_envs, dtype=bool)
         self._ticks = np.zeros(num_envs, dtype=np.int64)  # periods flown
@@ -175,10 +191,11 @@ class LanderVectorEnv(BatchedEnv):
         """Which failures the flights draw. A training may draw their sizes from a range."""
         sizes = self.training.failure_sizes or (self.failure_size, self.failure_size)
         verticals = self.training.failure_verticals or (self.failure_vertical, self.failure_vertical)
-        return Failure(self.setting("failure_probability"), sizes, verticals, self.failure_time)
+        return Failure(self.failure_probability, sizes, verticals, self.failure_time)
 
     def _drawn(self, draw) -> Flights:
-        return draw_flights(self.lander, draw, self.failure, self.training.start_spread)
+        handed = self.training
+        return draw_flights(self.lander, draw, self.failure, handed.start_spread, handed.edge_starts)
 
     def _observation_space(self):
         """The box that holds every observation."""
@@ -186,6 +203,10 @@ class LanderVectorEnv(BatchedEnv):
         r, v = lander.reach
         high = [r] * 3 + [v] * 3 + [lander.longest + PERIOD] + [1.0] * 3
         low = [-r] * 3 + [-v] * 3 + [0.0] + [-1.0] * 3
+        if self.observe_acceleration:
+            greatest = lander.greatest_thrust / lander.dry_mass + lander.gravity * (1 + 2 * lander.gravity_spread)
+            high += [greatest] * 3
+            low += [-greatest] * 3
         if self.observe_draw:
             spread = max(lander.gravity_spread, 1e-3)  # a box must have a width
             high += [1 + max(lander.mass_spread, 1e-3)] + [spread + 1e-9] * 3 + [1.0] * 3
@@ -213,6 +234,7 @@ class LanderVectorEnv(BatchedEnv):
         self._above[:, mask] = new.r
         self._nearest[mask] = np.inf
         self.u[mask] = 0.0
+        self.acceleration[:, mask] = [[0.0], [0.0], [-self.lander.gravity]]
         self.time[mask] = 0
         self._ticks[mask] = 0
         self.down[mask] = False
@@ -223,40 +245,31 @@ class LanderVectorEnv(BatchedEnv):
         has_struck = self._ticks * PERIOD >= self.flights.strike
         return np.where(has_struck, self.flights.failed, 1.0)
 
-    def sway(self) -> np.ndarray:
-        """The acceleration (3, N) of `wind` in m/s^2: a sine along x and one along y, with a period of 10 to 30 s.
-
-        Period and phases come from digits of the draw on which nothing else depends. So flights of one draw have the
-        same wind.
-        """
-        digits = self.draw * 1000 % 1
-        turns = self.time / (10 + 20 * digits[:, 2])
-        along_x, along_y = (np.sin(2 * np.pi * (turns + digits[:, axis])) for axis in (0, 1))
-        return self.training.wind * np.stack([along_x, along_y, np.zeros(self.num_envs)])
-
     def _observe(self):
         obs = np.empty((self.num_envs, self.single_observation_space.shape[0]))
         obs[:, 0:3] = self.r.T
         obs[:, 3:6] = self.v.T if self.observe_velocity else 0.0
         obs[:, 6] = self.time * self.observe_phase
         obs[:, 7:10] = self.u / self.lander.greatest_thrust if self.observe_command else 0.0
+        if self.observe_acceleration:
+            obs[:, 10:13] = self.acceleration.T
         if self.observe_draw:
-            obs[:, 10] = self.mass / self.lander.mass
-            obs[:, 11:14] = self.flights.gravity.T / self.lander.gravity + [0.0, 0.0, 1.0]
-            obs[:, 14:17] = self.effectiveness().T
+            obs[:, -7] = self.mass / self.lander.mass
+            obs[:, -6:-3] = self.flights.gravity.T / self.lander.gravity + [0.0, 0.0, 1.0]
+            obs[:, -3:] = self.effectiveness().T
         return obs
 
     def _advance(self, actions):
-        burnt = self.mass.copy()
-        greatest = self.lander.greatest_thrust
         handed = self.training
-        command = greatest * limited(actions.T, self.lander.least_thrust / greatest, handed.thrust_share)
+        greatest = self.lander.greatest_thrust
+        mass, v, time = self.mass, self.v, self.time
+        command = greatest * limited(actions.T, self.lander.least_thrust / greatest, 1.0)
         self.u[:] = command.T
         for _ in range(self._hold):
             self._fly(command)
         self.t += 1
-        price = handed.fuel_price * np.where(np.isfinite(self.flights.strike), handed.failed_fuel_share, 1.0)
-        rewards = -price / 100 * (burnt - self.mass)
+        self.acceleration = (self.v - v) / np.maximum(self.time - time, 1e-9)  # an ended flight does not move on
+        rewards = -handed.fuel_price / 100 * (mass - self.mass)
         if self._ended.any():
             end = np.where(self.down, slope_reward(self.slope(), handed.slope_price), -handed.aloft_price)
             speed_error = np.sqrt(self.v[0] ** 2 + self.v[1] ** 2 + (self.v[2] + handed.sink_rate) ** 2)
@@ -269,8 +282,7 @@ class LanderVectorEnv(BatchedEnv):
         lander = self.lander
         thrust = limited(command * self.effectiveness(), lander.least_thrust, lander.greatest_thrust)
         norm = np.sqrt((thrust * thrust).sum(axis=0))
-        gravity = self.flights.gravity + self.sway() if self.training.wind else self.flights.gravity
-        arc = Arc(self.r, self.v, self.mass, thrust / norm, norm / lander.exhaust, gravity)
+        arc = Arc(self.r, self.v, self.mass, thrust / norm, norm / lander.exhaust, self.flights.gravity)
         length = PERIOD
         r, v, mass = arc.after(PERIOD, lander)
         if self.published_end:

@@ -164,8 +164,13 @@ class Flights(NamedTuple):
 DRAW = ("x", "y", "z", "vx", "vy", "vz", "mass", "gx", "gy", "gz", "failure", "axis", "moment")
 
 
-def draw_flights(lander: Lander, draw: np.ndarray, failure: Failure, start_spread: float = 1.0) -> Flights:
+def draw_flights(
+    lander: Lander, draw: np.ndarray, failure: Failure, start_spread: float = 1.0, edge_starts: bool = False
+) -> Flights:
     """The flights of draws (n, 13). `start_spread` widens the box of the starts, but not its heights and sink rates.
+
+    With `edge_starts` more flights begin near the edges of the box. In each direction a start's place is that of a
+    swing at a random moment (the arcsine law), where it is else uniform.
 
     A flight has a failure if the draw's "failure" is below the probability. The failure weakens the thrust along x, if
     "axis" is below 0.5, or along y, and the thrust along z. In the failed flights "failure" / probability is uniform
@@ -176,7 +181,8 @@ def draw_flights(lander: Lander, draw: np.ndarray, failure: Failure, start_sprea
     spread = np.array(lander.spread)
     centred = 2 * draw - 1
     widths = np.array([start_spread, start_spread, 1.0] * 2)
-    state = start + widths * spread * centred[:, :6]
+    place = -np.cos(np.pi * draw[:, :6]) if edge_starts else centred[:, :6]
+    state = start + widths * spread * place
     gravity = lander.gravity * lander.gravity_spread * centred[:, 7:10]
     gravity[:, 2] -= lander.gravity
     has_failed = draw[:, 10] < failure.probability

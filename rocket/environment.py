@@ -25,6 +25,7 @@ from common.batch import (
     checked,
     numeric,
     refuse_autoreset,
+    switch,
 )
 from common.errors import BadInput, is_finite, refuse_unless
 from common.flying import fly_until_ended
@@ -74,7 +75,7 @@ class RocketTraining(Training):
 
     # scale of R_terminal in the reward, a curriculum; `final_info` keeps TERMINAL_SCALE
     terminal_scale: float = numeric(TERMINAL_SCALE, low=1e-12)
-    guidance: bool = checked(False, lambda value: isinstance(value, bool), "must be True or False")  # pay R_guidance
+    guidance: bool = switch()  # pay R_guidance
     # reward lost per `mass_unit` of propellant burnt in the last phase; our script pays `mass_rewards` instead
     propellant_price: float = numeric(0.0)
     # "ignition" for a while where the environment's `failure_time` is "random" (None: the environment's)
