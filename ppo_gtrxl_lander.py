@@ -123,7 +123,7 @@ class Args:
     lr_times_std: bool = False  # the learning rate is --learning-rate times the policy's std
     flights_per_start: flags.CountSchedule = Schedule(1)  # flights of each draw, compared with one another
     fuel_weight: flags.WeightSchedule = Schedule(1.0)  # reward lost for 100 kg of propellant in training
-    slope_weight: flags.WeightSchedule = Schedule(15.0)  # weight of a flat last descent in training (`slope_reward`)
+    slope_weight: flags.WeightSchedule = Schedule(2.0)  # weight of a flat last descent in training (`slope_reward`)
     # training holds an action for this many times --decision-s
     action_hold: Annotated[Schedule, flags.Range(1.0, 500.0)] = Schedule(1.0)
     weight_average: flags.Decay = 0.0  # decay, per optimiser step, of the averaged weights used in evaluation
@@ -155,8 +155,8 @@ OURS = {
     "target_kl": 0.03,
     "memory_noise": "0:0.01 1:0",
     "log_std": "0:-1 0.6:-2.5 1:-3.6",  # a policy that learned with less noise has less reserve
-    "fuel_weight": "0:4 0.12:4 0.25:14 0.5:14 0.7:9",  # how much is burnt is settled by the middle
-    "slope_weight": "0:0 0.5:0 0.7:15",  # only late, because few descents are steep while the noise is large
+    "fuel_weight": "0:4 0.12:4 0.25:12 0.5:12 0.7:8",  # how much is burnt is settled by the middle
+    "slope_weight": "0:0 0.5:0 0.7:4",  # only late, because few descents are steep while the noise is large
     "weight_average": 0.998,
     "decision_s": 0.4,
     "action_hold": "0:2.5 0.6:2.5 0.8:1",  # noise that is held explores farther, and steps of 1 s are cheap
@@ -247,7 +247,7 @@ BEYOND_VERTICAL = 3 / 2  # on Mars from 1.5 to 1.75
 BEYOND_START = 4 / 3  # along x and y
 ALOFT_PRICE = 20.0  # hovering above the pad must cost more than any miss
 SLOPE_HEIGHT = 10.0  # m; a descent that is steep from there on has time to become steeper
-SINK_RATE = 0.8  # m/s; a policy that aims at rest on the ground can come to rest just above it and hover
+SINK_RATE = 0.9  # m/s; a policy that aims at rest on the ground can come to rest just above it and hover
 
 
 def curriculum(args, progress):

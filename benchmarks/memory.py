@@ -167,32 +167,14 @@ EXPERIMENTS = {
         drawn=False,
     ),
     "lander": Experiment(
-        "Landing, failure at a random moment, the last command shown: share of the flights that landed",
+        "Landing, failure from the start: share of the flights that landed",
         {
-            **lengths(0, 1, 8, 32),
+            "memory_0": "L_mem 0",
+            "../../mars_landing": "L_mem 8",
             "mlp": "MLP of about the same size",
             "no_blocks": "MLP as wide as ours",
         },
         LANDED,
-    ),
-    "lander_recipe": Experiment(
-        "Landing, a whole training with 1024 flights an update, failure from the start",
-        {"memory_0": "L_mem 0", "memory_8": "L_mem 8", "mlp": "MLP of about the same size"},
-        LANDED,
-        drawn=False,
-    ),
-    "lander_conditions": Experiment(
-        "Landing, one condition changed",
-        {
-            "from_start_0": "L_mem 0, failure from the start",
-            "from_start_32": "L_mem 32, failure from the start",
-            "command_hidden_0": "L_mem 0, last command hidden",
-            "command_hidden_32": "L_mem 32, last command hidden",
-            "velocity_hidden_0": "L_mem 0, velocity hidden",
-            "velocity_hidden_32": "L_mem 32, velocity hidden",
-        },
-        LANDED,
-        drawn=False,
     ),
 }
 

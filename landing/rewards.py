@@ -17,9 +17,9 @@ FAR = 10.0  # m
 FAST = 2.0  # m/s; braking by 1 m/s must pay more than its propellant, which is 2 to 3 kg
 FUEL_PRICE = 1.0  # for 100 kg
 ALOFT_PRICE = 10.0  # for a flight that ends in the air
-SLOPE_PRICE = 15.0
+SLOPE_PRICE = 2.0
 STEEP = 20.0  # a steeper slope pays no more
-FLATTEST = 0.5  # a flatter slope costs no more
+FLATTEST = 0.05  # a flatter slope costs no more
 
 
 def has_landed(position_error, speed, slope, is_down):
@@ -39,5 +39,5 @@ def terminal_reward(position_error, speed, position_scale, speed_scale):
 
 
 def slope_reward(slope, price):
-    """-price (1 / slope - 1 / 20), at most 0. A metre aside costs the same on a steep descent as on a flat one."""
-    return -price * np.maximum(1 / np.maximum(slope, FLATTEST) - 1 / STEEP, 0.0)
+    """-price ln(20 / slope), at most 0. Each doubling of a flat slope pays the same, well beyond the limit of 5."""
+    return -price * np.log(np.maximum(STEEP / np.maximum(slope, FLATTEST), 1.0))

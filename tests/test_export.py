@@ -74,7 +74,8 @@ def options_of(env_id):
     if env_id in envs.ROCKETS:
         return [{}, *ROCKET_OPTIONS]
     if env_id in envs.LANDERS:
-        return [{}, {"observe_draw": True}, {"observe_velocity": False, "observe_command": False}]
+        hidden = {"observe_velocity": False, "observe_command": False}
+        return [{}, {"observe_acceleration": True, "observe_draw": True}, hidden]
     scores = [{"observe_draw": True}] if envs.PROBLEMS[env_id].scores else []
     return [{}, *PHASED_OPTIONS, *scores]
 

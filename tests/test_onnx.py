@@ -95,7 +95,7 @@ def write(script, checkpoint, path):
 CASES = [
     (ppo_gtrxl_di, {"observe_velocity": False, "memory_length": 0, "num_blocks": 2}),
     (ppo_gtrxl_vdp, {"env_id": "Goddard-v0", "num_blocks": 0}),
-    (ppo_gtrxl_lander, {"num_blocks": 2, "observe_draw": True}),
+    (ppo_gtrxl_lander, {"num_blocks": 2, "observe_acceleration": True, "observe_draw": True}),
 ]
 
 
