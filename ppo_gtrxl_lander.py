@@ -155,11 +155,11 @@ OURS = {
     "target_kl": 0.03,
     "memory_noise": "0:0.01 1:0",
     "log_std": "0:-1 0.6:-2.5 1:-3.6",  # a policy that learned with less noise has less reserve
-    "fuel_weight": "0:4 0.12:4 0.25:14 0.5:14 0.7:8",  # how much is burnt is settled by the middle
+    "fuel_weight": "0:4 0.12:4 0.25:14",  # how much is burnt is settled by the middle
     "slope_weight": "0:0 0.5:0 0.7:4",  # only late, because few descents are steep while the noise is large
     "weight_average": 0.998,
     "decision_s": 0.4,
-    "action_hold": "0:2.5 0.6:2.5 0.8:1",  # noise that is held explores farther, and steps of 1 s are cheap
+    "action_hold": "0:2.5 0.6:2.5 0.7:1",  # noise that is held explores farther, and steps of 1 s are cheap
 }
 MARS = {
     **OURS,

@@ -121,8 +121,8 @@ def test_the_curriculum_of_our_recipe():
     batch = gym.make_vec(ID, num_envs=2, decision_s=args.decision_s, longest_flight=args.longest_flight).unwrapped
     for progress, log_std, hold, fuel, slope in (
         (0, -1, 1.0, 4, 0),
-        (0.6, -2.5, 1.0, 11, 2),
-        (1, -3.6, 0.4, 8, 4),
+        (0.6, -2.5, 1.0, 14, 2),
+        (1, -3.6, 0.4, 14, 4),
     ):
         batch.reset(options={"training": script.curriculum(args, progress)})
         flown = batch.training
