@@ -190,7 +190,7 @@ def test_bonus_falls_to_nothing_over_its_width(env_id):
     np.testing.assert_allclose(sums[3] - sums[0], bonuses.sum(), rtol=1e-6)
 
 
-@pytest.mark.parametrize("env_id, name", [("VanDerPol-v0", "radius_scale"), ("MarsLanding-v0", "wind")])
+@pytest.mark.parametrize("env_id, name", [("VanDerPol-v0", "radius_scale"), ("MarsLanding-v0", "edge_starts")])
 def test_what_a_training_hands_over_is_no_attribute(env_id, name):
     """Assigning it would do nothing, so it is refused."""
     for env in (gym.make(env_id).unwrapped, gym.make_vec(env_id, num_envs=2).unwrapped):
