@@ -160,6 +160,7 @@ ENV_IDS = tuple(RECIPES)
 ENV_OPTIONS = ("observe_phase", "observe_velocity")  # arguments of the environments
 FIXED_OPTIONS = {"scaled_action": True}  # arguments that no flag sets
 INITIAL_ACTION = [0.0]  # the policy's output before training, in units of the bound
+STATE = slice(None)  # what tells the returns of one start's flights apart: all that is observed (`returns_baseline`)
 
 
 def constants(env_id):
@@ -680,10 +681,10 @@ def returns_baseline(batch, gamma, group):
         return torch.zeros_like(batch.rewards), torch.ones_like(batch.rewards[:, :1])
     no_values = torch.zeros_like(batch.critic)
     monte_carlo, _ = gae(batch.rewards, no_values, batch.alive, gamma, 1.0)
-    obs = batch.obs.unflatten(1, (-1, group))
+    state = batch.obs[..., STATE].unflatten(1, (-1, group))
     grouped_returns = monte_carlo.unflatten(1, (-1, group))
     alive = batch.alive.unflatten(1, (-1, group))
-    baseline = linear_fit(obs, grouped_returns, alive).flatten(1)
+    baseline = linear_fit(state, grouped_returns, alive).flatten(1)
     _, variance = moments(monte_carlo - baseline, batch.alive, 1)
     mean_spread = variance.sqrt().mean()  # steps that no flight reaches count as zeros
     scale = (variance + (SMALLEST_SPREAD * mean_spread) ** 2 + 1e-8).sqrt()

@@ -144,7 +144,7 @@ OURS = {
     "total_updates": 180,
     "num_envs": 1536,
     "num_minibatches": 48,
-    "flights_per_start": "0:16 0.7:16 0.7:8",  # more draws late
+    "flights_per_start": 16,
     "update_epochs": 4,
     "learning_rate": 3e-3,
     "lr_times_std": True,
@@ -182,6 +182,7 @@ ENV_OPTIONS = (  # arguments of the environments
 FIXED_OPTIONS = {}  # arguments that no flag sets
 INITIAL_ACTION = [0.0, 0.0, 0.4]  # thrust straight up, a little more than the weight
 OBSERVED = 10  # numbers that every lander shows: r, v, time, command; acceleration and draw come after them
+STATE = slice(0, 6)  # r and v: what tells the returns of one draw's flights apart (`returns_baseline`)
 DRAWN = 7  # numbers of the draw, with --observe-draw
 
 
@@ -752,10 +753,10 @@ def returns_baseline(batch, gamma, group):
         return torch.zeros_like(batch.rewards), torch.ones_like(batch.rewards[:, :1])
     no_values = torch.zeros_like(batch.critic)
     monte_carlo, _ = gae(batch.rewards, no_values, batch.alive, gamma, 1.0)
-    obs = batch.obs.unflatten(1, (-1, group))
+    state = batch.obs[..., STATE].unflatten(1, (-1, group))
     grouped_returns = monte_carlo.unflatten(1, (-1, group))
     alive = batch.alive.unflatten(1, (-1, group))
-    baseline = linear_fit(obs, grouped_returns, alive).flatten(1)
+    baseline = linear_fit(state, grouped_returns, alive).flatten(1)
     _, variance = moments(monte_carlo - baseline, batch.alive, 1)
     mean_spread = variance.sqrt().mean()  # steps that no flight reaches count as zeros
     scale = (variance + (SMALLEST_SPREAD * mean_spread) ** 2 + 1e-8).sqrt()

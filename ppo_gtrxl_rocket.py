@@ -227,6 +227,7 @@ ENV_OPTIONS = (  # arguments of the environments
 )  # fmt: skip
 FIXED_OPTIONS = {"action_frame": "local"}  # arguments that no flag sets; local is up, along-track, cross-track
 INITIAL_ACTION = [1.0, 0.0, 0.0]  # straight up (local frame), since a randomly steered rocket never leaves the ground
+STATE = slice(None)  # what tells the returns of one start's flights apart: all that is observed (`returns_baseline`)
 OBSERVED = 9  # numbers that every rocket shows: r, v, m, t_norm, phase; the draw comes after them
 LENGTH = 64  # in 100 km, about the Earth's radius
 SPEED = 8  # in km/s, about the circular speed at that radius
@@ -946,10 +947,10 @@ def returns_baseline(batch, gamma, group):
         return torch.zeros_like(batch.rewards), torch.ones_like(batch.rewards[:, :1])
     no_values = torch.zeros_like(batch.critic)
     monte_carlo, _ = gae(batch.rewards, no_values, batch.alive, gamma, 1.0)
-    obs = batch.obs.unflatten(1, (-1, group))
+    state = batch.obs[..., STATE].unflatten(1, (-1, group))
     grouped_returns = monte_carlo.unflatten(1, (-1, group))
     alive = batch.alive.unflatten(1, (-1, group))
-    baseline = linear_fit(obs, grouped_returns, alive).flatten(1)
+    baseline = linear_fit(state, grouped_returns, alive).flatten(1)
     _, variance = moments(monte_carlo - baseline, batch.alive, 1)
     mean_spread = variance.sqrt().mean()  # steps that no flight reaches count as zeros
     scale = (variance + (SMALLEST_SPREAD * mean_spread) ** 2 + 1e-8).sqrt()
