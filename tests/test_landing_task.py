@@ -65,6 +65,20 @@ def test_batches_do_not_change_a_flight():
     assert parts["y"].shape[0] == KEPT_FLIGHTS
 
 
+def test_flights_of_a_draw_are_compared_by_position_and_velocity():
+    """A fit that saw the command and the acceleration, too, would leave nearly nothing of what an action brings."""
+    generator = torch.Generator().manual_seed(0)
+    obs = torch.randn(3, 32, 13, generator=generator)
+    rewards = torch.randn(3, 32, generator=generator)
+    alive = torch.ones(3, 32)
+    batch = SimpleNamespace(obs=obs, rewards=rewards, critic=torch.zeros(3, 32), alive=alive)
+    baseline, _ = script.returns_baseline(batch, gamma=1.0, group=16)
+    obs[..., 6:] = 0.0  # time, command, acceleration
+    assert torch.equal(script.returns_baseline(batch, gamma=1.0, group=16)[0], baseline)
+    obs[..., 5] = 0.0  # vertical velocity
+    assert not torch.equal(script.returns_baseline(batch, gamma=1.0, group=16)[0], baseline)
+
+
 def test_the_optimum_lands_and_a_policy_is_measured_beside_it():
     task = task_of(ID)
     reference = task.optimum(3, 4)

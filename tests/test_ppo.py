@@ -330,6 +330,16 @@ def test_linear_fit_finds_a_line():
     assert fit.dtype == torch.float32 and np.abs(fit.numpy() - y).max() < 0.01 * np.ptp(y)
 
 
+@pytest.mark.parametrize("flights, numbers", [(16, 6), (32, 7), (8, 2)])
+def test_how_much_of_pure_noise_a_fit_leaves(flights, numbers):
+    """A least-squares fit of k numbers and a mean to G values leaves the share 1 - (k + 1) / G of their variance."""
+    generator = torch.Generator().manual_seed(0)
+    x = torch.randn(20_000, flights, numbers, generator=generator)
+    y = torch.randn(20_000, flights, generator=generator)
+    left = (y - script.linear_fit(x, y, torch.ones_like(y))).square().mean().item()
+    assert left == pytest.approx(1 - (numbers + 1) / flights, rel=0.02)
+
+
 @pytest.mark.parametrize("group", [1, 2])
 def test_steps_that_no_episode_reached(uneven_envs, group):
     run = Learner(uneven_envs([3, 2, 1, 1], spare_steps=2), flights_per_start=group)
