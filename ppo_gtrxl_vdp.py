@@ -668,10 +668,10 @@ def linear_fit(x, y, alive):
     """The values (..., G) that a linear regression of y (..., G) on x (..., G, k) predicts, over a group's G episodes.
 
     Only living episodes count. The regression has a small ridge penalty. An episode's own return is part of its fit.
-    So its residual is smaller by the factor 1 - leverage, and an episode in an extreme state counts less. The leverage
-    depends on the states of this step and not on the action. So with --gae-lambda 1 the expected policy gradient of a
-    state keeps its direction. Below 1 this holds only approximately. Fits that leave the episode out are worse
-    (docs/archive.md).
+    So its residual is smaller by the factor 1 - leverage, and an episode in an extreme state counts less. On average
+    the leverage is (k + 1) / G, so k should be small. It depends on the states of this step and not on the action. So
+    with --gae-lambda 1 the expected policy gradient of a state keeps its direction. Below 1 this holds only
+    approximately. Fits that leave the episode out are worse (docs/archive.md).
     """
     x = x.double()
     y = y.double()[..., None]  # (..., G, 1)
@@ -701,8 +701,9 @@ def returns_baseline(batch, gamma, group):
     is larger than the effect of an action. Flights of one start, compared with one another, still show that effect.
 
     Each `group` of neighbouring episodes flew the same start. Their returns from step t on are regressed linearly on
-    their observations at step t. The fit is the baseline. Its residuals have a spread at each step, over all flights of
-    all groups. scale^2 is the spread^2 of the step plus (SMALLEST_SPREAD x the mean spread of the steps)^2.
+    their state at step t, the observations that STATE names. The fit is the baseline. Its residuals have a spread at
+    each step, over all flights of all groups. scale^2 is the spread^2 of the step plus (SMALLEST_SPREAD x the mean
+    spread of the steps)^2.
 
     RLOO (Kool et al. 2019) takes the mean return of the other samples of a question as the baseline. GRPO (Shao et al.
     2024) takes the mean return of the whole group, and divides by the group's spread. Both have one return for each

@@ -58,7 +58,7 @@ def fly_checkpoint(path, failure: dict, eval_seed: int, n: int) -> dict:
     """
     metrics, _ = fly_by_script(POLICY_SCRIPT, path, {"eval_starts": n, "eval_seed": eval_seed, **failure})
     kept = {key: value for key, value in metrics.items() if isinstance(value, int | float)}
-    return kept | {"knows": "flights in training"}
+    return kept | {"knows": "flights in training; nominal mass, gravity and thrust"}
 
 
 # ---------------------------------------------------------------------------------------------------------------------
