@@ -348,7 +348,10 @@ def curriculum(args, progress):
 
 
 def add_rewards(args, progress, training, envs, batch, episodes):
-    """With cut-off, add `mass_rewards` to the flights' last steps."""
+    """With cut-off, add `mass_rewards` to the flights' last steps.
+
+    A flight that has lost thrust ends farther from the orbit than a healthy one. It is to save propellant all the same.
+    """
     weight = args.mass_weight.at(progress)
     if not envs.cutoff or weight == 0:
         return
@@ -356,7 +359,8 @@ def add_rewards(args, progress, training, envs, batch, episodes):
     group = len(compared_flights["error"])  # without draws all flights have the same start
     if has_draws(args):
         group = training["flights_per_start"]
-    paid = weight * mass_rewards(compared_flights, envs.rocket, training["terminal_scale"], group)
+    also_far = bool(args.failure)
+    paid = weight * mass_rewards(compared_flights, envs.rocket, training["terminal_scale"], group, also_far)
     paid = runs.local_shard(paid, envs.num_envs)  # the part of this process's flights
     last_step = batch.alive.sum(0).long() - 1  # (N,)
     flight = torch.arange(envs.num_envs)

@@ -75,7 +75,7 @@ def terminal_reward(error_norm, scale=TERMINAL_SCALE):
     return -2.0 * np.log1p(error_norm / scale)
 
 
-def mass_rewards(ends, rocket: Rocket, scale, group_size):
+def mass_rewards(ends, rocket: Rocket, scale, group_size, also_far=False):
     """Rewards (n,) for the mass that flights have left beyond what their misses saved. Ours, only in training.
 
     `ends` is the `final_info` of n flights, `scale` the scale of their R_terminal. Each `group_size` flights in a row
@@ -88,7 +88,8 @@ def mass_rewards(ends, rocket: Rocket, scale, group_size):
     mass and R_terminal are each regressed linearly on the terminal errors, which have four directions at one energy.
     The residuals of the mass are paid, scaled to the spread of R_terminal's residuals. In kilograms they would fall
     with the noise, and R_terminal, whose spread does not fall, would hide them. While the orbit is off to one side,
-    R_terminal is nearly linear in the errors, so little is paid.
+    R_terminal is nearly linear in the errors, so its residuals are small, and little is paid. With `also_far` the
+    spread is R_terminal's own, so as much is paid there as near the target.
     """
     cut_off = np.abs(1e3 * ends["a_km"] / rocket.a - 1) < 1e-6  # other energies would add a fifth direction
     near = cut_off & (ends["error_norm"] < 0.05)
@@ -104,6 +105,8 @@ def mass_rewards(ends, rocket: Rocket, scale, group_size):
         y = y - y.mean(axis=0)
         directions = np.linalg.svd(x, full_matrices=False)[0][:, :4]
         mass, terminal = (y - directions @ (directions.T @ y)).T
+        if also_far:
+            terminal = y[:, 1]
         paid[flights] = terminal.std() * mass / max(mass.std(), 1e-9)
     return paid
 

@@ -58,6 +58,19 @@ def test_residuals_in_units_of_the_terminal_rewards():
     np.testing.assert_allclose(at_the_end(paid(episodes, mass_weight=0.5)), expected / 4, rtol=1e-5, atol=1e-7)
 
 
+def test_where_thrust_may_be_lost_mass_counts_as_much_as_the_orbit():
+    """In units of R_terminal's own spread, which for flights that are off to one side is larger than its residuals'."""
+    episodes = flights(size=1e-4)
+    episodes["error"] += 0.005
+    episodes["error_norm"] = np.linalg.norm(episodes["error"], axis=1)
+    mass, residual = residuals(episodes)
+    terminal = terminal_reward(episodes["error_norm"], 0.002)
+    assert terminal.std() > 20 * residual.std()
+    for failure, spread in ((0.0, residual.std()), (0.25, terminal.std())):
+        rewards = at_the_end(paid(episodes, failure=failure, flights_per_start=N))
+        np.testing.assert_allclose(rewards, 0.4 * spread / mass.std() * mass, rtol=1e-4, atol=1e-9)
+
+
 def test_what_a_miss_saves_and_kilograms_do_not_count():
     episodes = flights()
     before = paid(episodes)
