@@ -207,7 +207,7 @@ def features(agent, obs):
     In the code 1 m/s, 0.5 s and 1 m are added, so that nothing is divided by 0.
     """
     more = obs.shape[-1] - OBSERVED
-    accelerations = more % DRAWN  # 3 or none
+    accelerations = 3 if more in (3, 3 + DRAWN) else 0
     r, v, time, command, acceleration, draw = obs.split([3, 3, 1, 3, accelerations, more - accelerations], dim=-1)
     lateral, vertical = (agent.greatest_acceleration * command).split([2, 1], dim=-1)
     expected = torch.cat([lateral, vertical - agent.gravity], dim=-1)

@@ -69,9 +69,12 @@ def velocity_from_the_second_step():
     return {"ratio_of_sums": flight["cost"].sum() / best["cost"].sum()}
 
 
+PLAIN = {"mlp": "MLP of about the same size", "no_blocks": "MLP as wide as ours"}
+
+
 def rocket_rows(result):
     """The rocket's rows. L_mem 32 is the front page's result, whose runs are not trained twice."""
-    return {**lengths(0, 1), f"../../{result}": "L_mem 32", "mlp": "MLP of about the same size"}
+    return {**lengths(0, 1), f"../../{result}": "L_mem 32", **PLAIN}
 
 
 DISPERSED = {
@@ -157,7 +160,7 @@ EXPERIMENTS = {
     ),
     "failures": Experiment(
         "Dispersed rocket, loss of thrust at a random moment: share of the savable flights that are saved",
-        {**lengths(0, 1, 32), "mlp": "MLP of about the same size"},
+        {**lengths(0), "../../rocket_failures": "L_mem 32", **PLAIN},
         FAILED,
     ),
     "navigation": Experiment(
@@ -169,10 +172,9 @@ EXPERIMENTS = {
     "lander": Experiment(
         "Landing, failure from the start: share of the flights that landed",
         {
-            "memory_0": "L_mem 0",
+            **lengths(0),
             "../../mars_landing": "L_mem 8",
-            "mlp": "MLP of about the same size",
-            "no_blocks": "MLP as wide as ours",
+            **PLAIN,
         },
         LANDED,
     ),

@@ -152,6 +152,7 @@ CHANGED = {
     "memory_0": {"memory_length": 0},
     "memory_1": {"memory_length": 1},
     "mlp": {"num_blocks": 0, "embed_dim": 192, "hidden_dim": 192},
+    "no_blocks": {"num_blocks": 0},
 }
 
 
@@ -180,7 +181,7 @@ def test_the_rockets_rows_are_the_shipped_commands_but_for_what_they_say(rocket_
     shipped = {(job.results.name, job.args["seed"]): job.args for job in rocket_jobs("results.txt")}
     nominal = rocket_jobs("memory_nominal.txt")
     dispersed = rocket_jobs("memory_rocket.txt")
-    assert [job.args["seed"] for job in nominal + dispersed] == [1] * 6
+    assert [job.args["seed"] for job in nominal + dispersed] == [1] * 8
     for result, experiment, jobs in (("rocket_cutoff", "nominal", nominal), ("rocket_dispersed", "rocket", dispersed)):
         rows = set(memory.EXPERIMENTS[experiment].rows)
         assert rows == {f"../../{result}", *CHANGED} and {job.results.name for job in jobs} == set(CHANGED)
@@ -193,10 +194,10 @@ def test_the_rockets_rows_are_the_shipped_commands_but_for_what_they_say(rocket_
 def test_rows_with_failures_are_the_shipped_command_but_for_what_they_say(rocket_jobs):
     shipped = [job.args for job in rocket_jobs("results.txt") if job.results.name == "rocket_failures"]
     assert [args["seed"] for args in shipped] == [1, 2, 3]
-    rows = ("memory_0", "memory_1", "mlp")
+    rows = ("memory_0", "mlp", "no_blocks")
     jobs = rocket_jobs("memory_failures.txt")
-    assert [job.args["seed"] for job in jobs] == [1, 2, 3, 1, 1, 2, 3]
-    assert set(memory.EXPERIMENTS["failures"].rows) == {"memory_32", *rows}
+    assert [(job.results.name, job.args["seed"]) for job in jobs] == [(row, seed) for row in rows for seed in (1, 2)]
+    assert set(memory.EXPERIMENTS["failures"].rows) == {"../../rocket_failures", *rows}
     for job in jobs:
         theirs = shipped[job.args["seed"] - 1]
         different = {name: value for name, value in job.args.items() if value != theirs[name]}
