@@ -187,7 +187,8 @@ FIRST_POLICY = {  # the policy with which a dispersed training begins, by enviro
     "RocketAscentCutoff-v0": "results/rocket_cutoff/agent.safetensors",
     "TwoStageLEO-v0": "results/two_stage_leo/agent.safetensors",
 }
-FIRST_OF_FAILING = {"RocketAscentCutoff-v0": "results/rocket_dispersed/agent.safetensors"}  # the same with --failure
+# the same with --failure: a network without blocks, which saves more flights (docs/failures.md)
+FIRST_OF_FAILING = {"RocketAscentCutoff-v0": "results/memory/rocket/no_blocks/agent.safetensors"}
 
 
 def has_draws(args):

@@ -160,7 +160,7 @@ EXPERIMENTS = {
     ),
     "failures": Experiment(
         "Dispersed rocket, loss of thrust at a random moment: share of the savable flights that are saved",
-        {**lengths(0), "../../rocket_failures": "L_mem 32", **PLAIN},
+        {**lengths(0, 32), "mlp": PLAIN["mlp"], "../../rocket_failures": PLAIN["no_blocks"]},
         FAILED,
     ),
     "navigation": Experiment(

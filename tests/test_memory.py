@@ -194,7 +194,11 @@ def test_the_rockets_rows_are_the_shipped_commands_but_for_what_they_say(rocket_
 def test_rows_with_failures_are_the_shipped_command_but_for_what_they_say(rocket_jobs):
     shipped = [job.args for job in rocket_jobs("results.txt") if job.results.name == "rocket_failures"]
     assert [args["seed"] for args in shipped] == [1, 2, 3]
-    rows = ("memory_0", "mlp", "no_blocks")
+    rows = {
+        "memory_0": {"num_blocks": 2, "memory_length": 0},
+        "memory_32": {"num_blocks": 2},
+        "mlp": {"embed_dim": 192, "hidden_dim": 192},
+    }
     jobs = rocket_jobs("memory_failures.txt")
     assert [(job.results.name, job.args["seed"]) for job in jobs] == [(row, seed) for row in rows for seed in (1, 2)]
     assert set(memory.EXPERIMENTS["failures"].rows) == {"../../rocket_failures", *rows}
@@ -202,7 +206,7 @@ def test_rows_with_failures_are_the_shipped_command_but_for_what_they_say(rocket
         theirs = shipped[job.args["seed"] - 1]
         different = {name: value for name, value in job.args.items() if value != theirs[name]}
         different.pop("checkpoint", None)
-        assert different == CHANGED[job.results.name], shlex.join(job.command)
+        assert different == rows[job.results.name], shlex.join(job.command)
 
 
 def test_rows_with_noise_are_the_shipped_command_but_for_what_they_say(rocket_jobs):
