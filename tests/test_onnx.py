@@ -32,24 +32,28 @@ ROOT = Path(__file__).parents[1]
 TOLERANCE = 1e-5
 
 
-RESULT = ROOT / "results" / "rocket_failures"
+RESULT = ROOT / "results" / "rocket_dispersed"
+WITHOUT_BLOCKS = ROOT / "results" / "rocket_failures"
 
 
 @pytest.fixture(scope="module")
-def failing(tmp_path_factory):
-    """The shipped policy of rockets that lose thrust, exported as the command does. It has a direct path."""
-    path = tmp_path_factory.mktemp("onnx") / "policy.onnx"
-    evaluate.export(RESULT, {"onnx": path})
-    return path
+def exported(tmp_path_factory):
+    """Shipped policies, exported as the command does: one with memory, and an MLP with a direct path."""
+    folder = tmp_path_factory.mktemp("onnx")
+    paths = {result: folder / f"{result.name}.onnx" for result in (RESULT, WITHOUT_BLOCKS)}
+    for result, path in paths.items():
+        evaluate.export(result, {"onnx": path})
+    return paths
 
 
 @pytest.mark.slow
-def test_a_policy_acts_as_torchs_in_float64(failing):
+@pytest.mark.parametrize("result", [RESULT, WITHOUT_BLOCKS], ids=lambda result: result.name)
+def test_a_policy_acts_as_torchs_in_float64(exported, result):
     """Several flights at once, by features that magnify rounding 20 000 times: torch's in float32 is 4e-5 off."""
     n = 3
-    agent, args, options = load(RESULT / "agent.safetensors")
+    agent, args, options = load(result / "agent.safetensors")
     steps = gym.make_vec(args.env_id, num_envs=1, **options).episode_steps + 20  # drawn flights may be longer
-    policies = {"float32": agent.make_policy(steps), "onnx": OnnxPolicy(failing)}
+    policies = {"float32": agent.make_policy(steps), "onnx": OnnxPolicy(exported[result])}
     policies["float64"] = copy.deepcopy(agent).double().make_policy(steps)
     _, actions = compare(args.env_id, policies, n=n, **options)
     assert np.isfinite(actions["onnx"]).all(axis=2).sum() > 450 * n
@@ -58,16 +62,16 @@ def test_a_policy_acts_as_torchs_in_float64(failing):
 
 
 @pytest.mark.slow
-def test_a_flight_by_onnxruntime_alone_ends_in_the_orbit(failing):
+def test_a_flight_by_onnxruntime_alone_ends_in_the_orbit(exported):
     metrics = json.loads((RESULT / "eval.json").read_text())
-    flight = fly_rocket(metrics["env_id"], OnnxPolicy(failing), action_frame="local")
+    flight = fly_rocket(metrics["env_id"], OnnxPolicy(exported[RESULT]), action_frame="local")
     assert flight["error_norm"] == pytest.approx(metrics["error_norm"], abs=1e-6)
     assert flight["final_mass_kg"] == pytest.approx(metrics["final_mass_kg"], abs=0.01)
 
 
 @pytest.mark.slow
-def test_the_model_says_what_it_takes(failing):
-    found = OnnxPolicy(failing)
+def test_the_model_says_what_it_takes(exported):
+    found = OnnxPolicy(exported[RESULT])
     metrics = json.loads((RESULT / "eval.json").read_text())
     assert {key: found.metadata[key] for key in ("checkpoint_sha256", "env_id", "step_s")} == {
         "checkpoint_sha256": metrics["checkpoint_sha256"],
