@@ -222,7 +222,8 @@ def test_a_dispersed_training_begins_with_the_shipped_policy(monkeypatch, capsys
     args = dispersed()
     assert args.checkpoint == "results/rocket_cutoff/agent.safetensors" and str(args.log_std) == "0:-3.5 1:-6.5"
     failing = dispersed("--failure=0.25")
-    assert failing.checkpoint == "results/rocket_dispersed/agent.safetensors" and failing.total_updates == 225
+    assert failing.checkpoint == "results/memory/rocket/no_blocks/agent.safetensors" and failing.total_updates == 225
+    assert failing.num_blocks == 0  # of its first policy
     anew = dispersed("--embed-dim=8")
     assert anew.checkpoint is None and anew.num_envs == 64
     assert str(anew.log_std) == ROCKET.RECIPES["RocketAscentCutoff-v0"]["log_std"]  # not that of a trained policy
