@@ -187,7 +187,7 @@ FIRST_POLICY = {  # the policy with which a dispersed training begins, by enviro
     "RocketAscentCutoff-v0": "results/rocket_cutoff/agent.safetensors",
     "TwoStageLEO-v0": "results/two_stage_leo/agent.safetensors",
 }
-# the same with --failure: a network without blocks, which saves more flights (docs/failures.md)
+# the same with --failure: of a network without blocks, which does better there (docs/failures.md)
 FIRST_OF_FAILING = {"RocketAscentCutoff-v0": "results/memory/rocket/no_blocks/agent.safetensors"}
 
 
