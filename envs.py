@@ -34,12 +34,13 @@ from common.registration import REMARKS, RegisteredIds
 from common.tasks import add_family
 from landing.lander import LANDERS, MARS, POWERED_DESCENT, Lander, register_lander
 from phased.problem import PROBLEMS, Phase, Problem, register_problem, uniform
-from rocket.missions import PAPER_MISSION, ROCKETS, Mission, register_rocket
+from rocket.missions import ANY_ORBIT, PAPER_MISSION, ROCKETS, Mission, register_rocket
+from rocket.targets import Targets
 from rocket.vehicle import ROCKET, Burn, Engine, Rocket, delta_v, launch_raan
 
 __all__ = [  # what users import from here; the rest of it is in `ON_DEMAND`
     "LANDERS", "MARS", "PAPER_MISSION", "POWERED_DESCENT", "PROBLEMS", "ROCKET", "ROCKETS", "BadInput", "Burn",
-    "Engine", "Lander", "Mission", "Phase", "Problem", "Rocket", "delta_v", "launch_raan", "own_ids",
+    "Engine", "Lander", "Mission", "Phase", "Problem", "Rocket", "Targets", "delta_v", "launch_raan", "own_ids",
     "register_lander", "register_problem", "register_rocket", "uniform",
 ]  # fmt: skip
 
@@ -210,6 +211,7 @@ def keep_remarks(file: str, rockets, caught: list):
 
 register_rocket("RocketAscent-v0", **vars(PAPER_MISSION))
 register_rocket("RocketAscentCutoff-v0", **vars(replace(PAPER_MISSION, cutoff=True, floor_km=110.0)))
+register_rocket("RocketAscentAnyOrbit-v0", **vars(ANY_ORBIT))
 register_lander("MarsLanding-v0", MARS)
 register_lander("PoweredDescent-v0", POWERED_DESCENT)
 import_files_of("problems")

@@ -4,6 +4,7 @@
     python ppo_gtrxl_rocket.py --seed 1 --env-id RocketAscentCutoff-v0  # free final time
     python ppo_gtrxl_rocket.py --seed 1 --env-id RocketAscentCutoff-v0 --dispersion 1  # every flight another vehicle
     python ppo_gtrxl_rocket.py --seed 1 --env-id RocketAscentCutoff-v0 --dispersion 1 --failure 0.3  # half lose thrust
+    python ppo_gtrxl_rocket.py --seed 1 --env-id RocketAscentAnyOrbit-v0  # every flight another orbit
     python ppo_gtrxl_rocket.py --seed 1 --recipe paper                  # plain PPO with Table 1
     python ppo_gtrxl_rocket.py --eval-only --checkpoint results/rocket_fixed/agent.safetensors
 
@@ -181,10 +182,17 @@ FAILING = {  # replaces values of DISPERSED; training begins with a policy of he
     "direct_differences": True,  # a failure makes them large, and the blocks go on wrongly beyond what they have seen
     "mass_weight": "0.1:0 0.2:1 0.5:1 0.85:0",  # so that failed flights burn less
 }
+ANY_ORBIT = {  # replaces values of CUTOFF
+    "total_updates": 400,
+    "num_envs": 96,
+    "flights_per_start": 16,
+}
 RECIPES = {env_id: CUTOFF if mission.cutoff else FIXED for env_id, mission in ROCKETS.items()}
+RECIPES |= {env_id: {**CUTOFF, **ANY_ORBIT} for env_id, mission in ROCKETS.items() if mission.targets}
 FIRST_POLICY = {  # the policy with which a dispersed training begins, by environment id
     "RocketAscent-v0": "results/rocket_fixed/agent.safetensors",
     "RocketAscentCutoff-v0": "results/rocket_cutoff/agent.safetensors",
+    "RocketAscentAnyOrbit-v0": "results/rocket_any_orbit/agent.safetensors",
     "TwoStageLEO-v0": "results/two_stage_leo/agent.safetensors",
 }
 # the same with --failure: of a network without blocks, which does better there (docs/failures.md)
@@ -194,6 +202,11 @@ FIRST_OF_FAILING = {"RocketAscentCutoff-v0": "results/memory/rocket/no_blocks/ag
 def has_draws(args):
     """Whether every flight draws its own vehicle or failure."""
     return bool(args.dispersion or args.failure)
+
+
+def flights_differ(args):
+    """Whether flights have vehicles, failures or targets of their own."""
+    return has_draws(args) or ROCKETS[args.env_id].targets is not None
 
 
 def recipe(args, anew=False):
@@ -230,13 +243,41 @@ FIXED_OPTIONS = {"action_frame": "local"}  # arguments that no flag sets; local 
 INITIAL_ACTION = [1.0, 0.0, 0.0]  # straight up (local frame), since a randomly steered rocket never leaves the ground
 STATE = slice(None)  # what tells the returns of one start's flights apart: all that is observed (`returns_baseline`)
 OBSERVED = 9  # numbers that every rocket shows: r, v, m, t_norm, phase; the draw comes after them
+TOLD = (
+    8  # numbers of a flight's own target: unit vectors to its perigee and normal to its plane, momentum, eccentricity
+)
 LENGTH = 64  # in 100 km, about the Earth's radius
 SPEED = 8  # in km/s, about the circular speed at that radius
+LAST_STEP = 0.004  # of that speed: about what the last stage gains in a step
 
 
 def constants(env_id):
     """The buffers of an environment's agents, saved with the weights; `features` reads them as agent.<name>."""
     return policy_constants(ROCKETS[env_id].rocket)
+
+
+class Target(NamedTuple):
+    """The target orbit of observations (...,), in units in which mu = 1. One orbit, or each observation its own."""
+
+    axes: torch.Tensor  # (3, 3) or (..., 3, 3): rows to the perigee, along the semi-latus rectum, normal
+    h: torch.Tensor  # (3,) or (..., 3) angular momentum, in these axes
+    e: torch.Tensor  # (3,) or (..., 3) eccentricity vector, in these axes
+
+
+def target_of(agent, obs):
+    """The Target of observations (..., 9 or more): the rocket's own, or the one that they show."""
+    if not agent.sees_target:
+        return Target(agent.axes, agent.h_target, agent.e_target)
+    perigee, normal, momentum, eccentricity = obs[..., OBSERVED : OBSERVED + TOLD].split([3, 3, 1, 1], dim=-1)
+    axes = torch.stack([perigee, torch.linalg.cross(normal, perigee), normal], dim=-2)
+    momentum = momentum / (agent.units[0] * agent.units[3])
+    none = torch.zeros_like(momentum)
+    return Target(axes, torch.cat([none, none, momentum], dim=-1), torch.cat([eccentricity, none, none], dim=-1))
+
+
+def along(axes, x):
+    """Components (..., 3) of vectors x (..., 3) along axes (3, 3), or along each one's own axes (..., 3, 3)."""
+    return x @ axes.T if axes.ndim == 2 else (axes * x[..., None, :]).sum(-1)
 
 
 class Motion(NamedTuple):
@@ -260,8 +301,9 @@ class Motion(NamedTuple):
 def motion(agent, obs):
     """The Motion of observations (..., 9 or more)."""
     r, v, mass = (obs[..., :7] / agent.units).split([3, 3, 1], dim=-1)
-    r = r @ agent.axes.T
-    v = v @ agent.axes.T
+    target = target_of(agent, obs)
+    r = along(target.axes, r)
+    v = along(target.axes, v)
     radius = r.norm(dim=-1, keepdim=True)
     speed = v.norm(dim=-1, keepdim=True)
     h = torch.linalg.cross(r, v)
@@ -274,7 +316,7 @@ def motion(agent, obs):
         out_of_plane=torch.cat([LENGTH * r[..., 2:], SPEED * v[..., 2:]], dim=-1),
         speed=speed,
         energy=speed**2 / 2 - 1 / radius,
-        error=torch.cat([(h - agent.h_target) / agent.h_target.norm(), e - agent.e_target], dim=-1),
+        error=torch.cat([(h - target.h) / target.h.norm(dim=-1, keepdim=True), e - target.e], dim=-1),
         log_mass=mass.log(),
         angle=torch.atan2(r[..., 1:2], r[..., :1]),
     )
@@ -286,21 +328,55 @@ def features(agent, obs):
     - position and velocity, altitude, climb, position and speed out of the plane, speed (`Motion`)
     - the share of the time that is left, log mass, the phase one-hot
     - the orbit's error, and tanh(10 error), which shows small errors
+    - where flights have targets of their own: `to_the_target`
     - the draw, with --observe-draw
-    - the flight's `differences` from the nominal flight, clipped at NEAR because tanh would flatten them
+    - where all fly to one: the `differences` from the nominal flight, clipped at NEAR because tanh would flatten them
 
     The paper's policy sees the environment's observation alone: r and v in ECI, m, t_norm and the phase.
     """
     m = motion(agent, obs)
-    time_left, phase, draw = obs[..., 7:8], obs[..., 8:9], obs[..., OBSERVED:]
+    time_left, phase = obs[..., 7:8], obs[..., 8:9]
+    draw = obs[..., OBSERVED + TOLD * agent.sees_target :]
     one_hot = ((phase - agent.phases).abs() < 1e-3).to(obs.dtype)  # phase: 0 to 1 (the paper's 0 to 3)
-
-    differs = differences(agent, m, phase).clamp(-NEAR, NEAR)
 
     seen = [m.r, m.v, m.altitude, m.climb, m.out_of_plane, m.speed, time_left, m.log_mass, one_hot]
     seen += [m.error, (10 * m.error).tanh()]
-    seen += [draw, differs]  # last: `show_differences` clears their weights
+    if agent.sees_target:
+        seen += [to_the_target(m, target_of(agent, obs)), draw]
+    else:
+        seen += [draw, differences(agent, m, phase).clamp(-NEAR, NEAR)]  # last: `show_differences` clears their weights
     return torch.cat(seen, dim=-1)
+
+
+def to_the_target(m, target):
+    """What a policy sees of its own Target (..., 12), by its Motion `m`. Every number is ours, in this order:
+
+    - the target's momentum, eccentricity, perigee (100 km above the ground) and energy
+    - the speed that is missing for this energy, and its logarithm
+    - altitude and climb off the target's at the same angle from the perigee, in 100 km and km/s
+    - what is to be made up for while this speed is gained: the last two, then position and speed out of the plane
+
+    Under a constant thrust a place off by x at a missing speed dv needs a turn in proportion to x / dv^2, and a speed
+    off by x one in proportion to x / dv. So the last four hardly depend on how far the flight is from its end.
+    """
+    momentum, eccentricity = target.h[..., 2:], target.e[..., :1]
+    energy = (eccentricity**2 - 1) / (2 * momentum**2)
+    perigee = momentum**2 / (1 + eccentricity)
+
+    radius = m.r.norm(dim=-1, keepdim=True)
+    missing = (2 * (energy + 1 / radius)).clamp(min=0.0).sqrt() - m.speed
+
+    x, y, z = m.r.split(1, dim=-1)
+    vx, vy, vz = m.v.split(1, dim=-1)
+    in_plane = (x**2 + y**2).sqrt()
+    too_high = in_plane - momentum**2 / (1 + eccentricity * x / in_plane)
+    too_fast = (x * vx + y * vy) / in_plane - eccentricity * y / (in_plane * momentum)
+
+    left = missing.abs() + LAST_STEP
+    to_make_up = torch.cat([too_high / left**2, z / left**2, too_fast / left, vz / left], dim=-1)
+    orbit = [SPEED * (momentum - 1), eccentricity, LENGTH * (perigee - 1), energy]
+    speed = [missing, (missing.clamp(min=0.0) / 0.01).log1p() / 5]
+    return torch.cat([*orbit, *speed, LENGTH * too_high, SPEED * too_fast, (2 * to_make_up).asinh()], dim=-1)
 
 
 def mean_action(output, action_scale):
@@ -317,6 +393,9 @@ def describe(episodes, metrics):
     line = f"return {episodes['episodic_return'].mean():7.2f}  sampled error {np.median(episodes['error_norm']):.4f}"
     if not metrics:
         return line
+    if "target_starts" in metrics:
+        line += f"  targets: median {metrics['target_error_median']:.6f} p95 {metrics['target_error_p95']:.6f}"
+        line += f" max {metrics['target_error_max']:.4f} box {metrics['target_box_rate']:.3f}"
     orbit = f"a {metrics['a_km']:.1f} km  e {metrics['e']:.4f}  i {metrics['i_deg']:.2f}"
     return f"{line}  mean action: error {metrics['error_norm']:.6f}  {orbit}  mass {metrics['final_mass_kg']:.1f} kg"
 
@@ -340,7 +419,7 @@ def curriculum(args, progress):
     }
     if args.log_std.has_points:
         std = math.exp(args.log_std.at(progress))
-        smallest = 0.001 if has_draws(args) else 0.0
+        smallest = 0.001 if flights_differ(args) else 0.0
         training["terminal_scale"] = min(TERMINAL_SCALE, max(std / 8, smallest))
     if args.failure and args.failure_time == "random":
         updates_before = round(progress * (args.total_updates - 1))
@@ -358,7 +437,7 @@ def add_rewards(args, progress, training, envs, batch, episodes):
         return
     compared_flights = runs.gathered(episodes)  # of all processes
     group = len(compared_flights["error"])  # without draws all flights have the same start
-    if has_draws(args):
+    if flights_differ(args):
         group = training["flights_per_start"]
     also_far = bool(args.failure)
     paid = weight * mass_rewards(compared_flights, envs.rocket, training["terminal_scale"], group, also_far)
@@ -452,7 +531,8 @@ def show_differences(agent, args, env_options):
     before at first.
     """
     begins = has_draws(args) and args.checkpoint is not None and args.resume is None and not args.eval_only
-    if not begins or has_nominal_flight(agent):  # a policy of a dispersed training has its nominal flight already
+    # a policy that sees its target has no nominal flight, and one of a dispersed training has its own already
+    if not begins or agent.sees_target or has_nominal_flight(agent):
         return
     exact = {**env_options, "dispersion": 0.0, "failure": 0.0, "navigation_noise": None}
     envs = gym.make_vec(args.env_id, num_envs=1, **exact)
@@ -640,6 +720,7 @@ class Agent(nn.Module):
         self.num_blocks = args.num_blocks
         self.memory_length = args.memory_length
         self.embed_dim = d
+        self.sees_target = ROCKETS[args.env_id].targets is not None  # this problem
         self.direct = None  # this problem
         if args.direct_differences:  # this problem
             self.direct = linear(len(DIFFERENCES), d, gain=0.0, bias=None)  # this problem

@@ -423,7 +423,7 @@ class SingleEnv(gym.Env):
         """Start anew. Returns the observation and an empty info. `options` are the batch's without their first axis."""
         super().reset(seed=seed)
         self._running = False  # stays so if the options are refused
-        for name in ("x0", "draw", "noise"):
+        for name in ("x0", "draw", "noise", "target"):
             if options and name in options:
                 options = {**options, name: [options[name]]}
         obs, info = self.batch.reset(seed=seed, options=options)

@@ -11,6 +11,7 @@ import numpy as np
 
 from common.errors import refuse_unless
 from exports.page import Page, network
+from rocket.any_orbit import flown_to, solve_targets
 from rocket.dispersion import (
     DISPERSION,
     WIND_ALTITUDE,
@@ -22,15 +23,18 @@ from rocket.dispersion import (
     draw_vehicles,
 )
 from rocket.guidance import tracked
+from rocket.metrics import apsides
 from rocket.missions import Mission
 from rocket.orbits import target_axes, target_orbit
 from rocket.policy_constants import DIFFERENCES
+from rocket.targets import launch_plane, site_plane
 from rocket.task import RocketTask
 from rocket.vehicle import EngineGroup, Rocket, engine_groups
 
 OPTIONS = {"observe_phase": True, "observe_draw": False, "observe_mass": False}  # a policy is trained with these
 SLIDER_SIGMAS = 6  # how far a slider goes, in standard deviations of a draw
 SEEN = 8 + 3 + 2 + 12  # number of `features` of the script, without those of the phase, the draw and the differences
+TO_THE_TARGET = 12  # number of those of a target of its own
 
 
 def page(task: RocketTask, metrics: dict, arrays: dict, checkpoint: dict, launch_longitude: float) -> Page:
@@ -45,17 +49,20 @@ def page(task: RocketTask, metrics: dict, arrays: dict, checkpoint: dict, launch
     refuse_unless(not rocket.table_isp, f"table_isp of {env_id}", rocket.table_isp, allowed)
     check_drawable(rocket)
     options = {name: checkpoint["args"].get(name, default) for name, default in OPTIONS.items()}
+    alike = mission.targets is None  # all fly to one orbit
     scores = len(draw_names(rocket)) if options["observe_draw"] else 0
     optimum = {key: arrays[f"{key}_reference"] for key in ("t", "u", "y")}
-    policy = network(checkpoint, SEEN + len(rocket.burns) + scores + len(DIFFERENCES))
+    policy = network(checkpoint, SEEN + len(rocket.burns) + scores + (len(DIFFERENCES) if alike else TO_THE_TARGET))
     dispersion = checkpoint["args"].get("dispersion", 0.0)
+    of_laws = {"sliders": sliders(rocket), "optimum": {"t": optimum["t"]} | tracked(mission, optimum)._asdict()}
+    if not alike:
+        of_laws = {"sliders": target_sliders(mission), "optimum": optimum, "optima": grid_optima(env_id, mission)}
     data = {
         "env_id": env_id,
         "launch_longitude": launch_longitude,
         "rocket": constants(mission, dispersion),
-        "sliders": sliders(rocket),
-        "policy": policy | {"options": options},
-        "optimum": {"t": optimum["t"]} | tracked(mission, optimum)._asdict(),
+        **of_laws,
+        "policy": policy | {"options": options, "sees_target": not alike},
         "python": {key: metrics[key] for key in ("error_norm", "final_mass_kg", "final_time_s")},
     }
     return Page("ascent", f"{env_id}: fly it", data)
@@ -77,6 +84,7 @@ def constants(mission: Mission, dispersion: float) -> dict:
         "h_target": h_target.tolist(),
         "e_target": e_target.tolist(),
         "axes": target_axes(rocket).tolist(),
+        "targets": None if mission.targets is None else plane_constants(rocket),
         "a": rocket.a,
         "e": rocket.e,
         "burns": [
@@ -141,3 +149,55 @@ def sliders(rocket: Rocket) -> list[dict]:
         }
         for name, label, unit, scale, sigma, step, most in rows
     ]
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Any orbit
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def plane_constants(rocket: Rocket) -> dict:
+    """What the page's `withTarget` reads to place a target about the launch site."""
+    node, site = (float(angle) for angle in launch_plane(rocket, rocket.i))
+    north, _ = site_plane(rocket.latitude, rocket.i)
+    return {
+        "latitude": rocket.latitude,
+        "goes_south": bool(abs(node - north) > 1e-9),
+        "own_argp_from_site": rocket.argp - site,  # degrees
+    }
+
+
+def target_sliders(mission: Mission) -> list[dict]:
+    """The page's sliders of the target: their ranges, and where they stand for the rocket's own orbit.
+
+    The apogee's slider moves by its logarithm.
+    """
+    rocket = mission.rocket
+    own = apsides(rocket.a / 1e3, rocket.e, rocket)
+    rows = [
+        ("perigee", "perigee", "km", mission.targets.perigee_km, own["perigee_km"], 1.0, False),
+        ("apogee", "apogee", "km", mission.targets.apogee_km, own["apogee_km"], 0.01, True),
+        ("i", "inclination", "°", mission.targets.i_deg, rocket.i, 0.1, False),
+        ("argp", "perigee off its natural place", "°", mission.targets.argp_deg, 0.0, 0.1, False),
+    ]
+    names = ("name", "label", "unit", "range", "value", "step", "logarithmic")
+    return [dict(zip(names, row)) for row in rows]
+
+
+def grid_optima(env_id: str, mission: Mission) -> list[dict]:
+    """The optima of a grid of targets with the sliders' numbers, for the page to show the nearest.
+
+    The perigee and its place are in the middle of their ranges.
+    """
+    ranges = mission.targets
+    shares = [[0.5, apogee, i, 0.5, 0.5] for apogee in np.linspace(0, 1, 4) for i in np.linspace(0, 1, 3)]
+    targets = ranges.at(shares, mission.rocket)
+    optima = solve_targets(env_id, mission, targets, processes=1)
+    flights = flown_to(env_id, targets, optima)
+    rows = []
+    for (_, apogee, i, *_), flight in zip(shares, flights):
+        low, high = np.log(ranges.apogee_km)
+        place = {"apogee": float(np.exp(low + apogee * (high - low))), "i": float(np.interp(i, (0, 1), ranges.i_deg))}
+        place |= {"perigee": float(np.mean(ranges.perigee_km)), "argp": float(np.mean(ranges.argp_deg))}
+        rows.append({"target": place} | {key: flight[key].astype(np.float32) for key in ("t", "u", "y")})
+    return rows

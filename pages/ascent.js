@@ -3,16 +3,16 @@
 // The page of a rocket: sliders, the button that takes thrust, time, readings and charts around the scene.
 // It needs all other scripts of the page.
 
-const NAMES = ["policy", "optimum", "openLoop", "lqr"];
-
 class AscentPage {
   constructor(data) {
     this.data = data;
     this.rocket = data.rocket;
+    this.names = data.optima ? ["policy", "optimum"] : ["policy", "optimum", "openLoop", "lqr"];
     this.changes = { ...NO_CHANGES };
     this.time = 0;
     this.element = (id) => document.getElementById(id);
-    this.optimum = this.storedOptimum();
+    this.optimum = storedFlight(data.optimum, data.rocket);
+    this.showLaws();
     this.altitude = new Chart(this.element("altitude"), { x: "time (s)", y: "altitude (km)" });
     this.pitch = new Chart(this.element("pitch"), { x: "time (s)", y: "thrust above the horizon (°)" });
     this.scene = this.makeScene();
@@ -39,16 +39,28 @@ class AscentPage {
       return scene;
     } catch (error) {
       container.textContent = `No picture in three dimensions: ${error.message}`;
-      return { setFlights() {}, show() {}, look() {} };
+      return { setFlights() {}, setRocket() {}, show() {}, look() {} };
     }
   }
 
-  storedOptimum() {
-    const { t, u, y } = this.data.optimum;
-    const rows = (array) => Array.from({ length: array.shape[0] }, (_, k) => Array.from(rowOf(array, k)));
-    const flight = { t: Array.from(t.values), u: rows(u), y: rows(y) };
-    const last = flight.y[flight.y.length - 1];
-    return { ...flight, errorNorm: Math.hypot(...terminalError(last, this.rocket)) };
+  // Leave out what a page of any orbit does not have: classical laws about one optimum, and other vehicles.
+  showLaws() {
+    const { optima } = this.data;
+    const left = optima ? ".one-orbit" : ".any-orbit";
+    document.querySelectorAll(left).forEach((element) => element.remove());
+    if (!optima) {
+      return;
+    }
+    this.optima = optima.map(({ target, ...flight }) => {
+      const rocket = withTarget(this.data.rocket, target);
+      return { target, rocket, flight: storedFlight(flight, rocket) };
+    });
+    const select = this.element("stored");
+    this.optima.forEach(({ target }, k) => {
+      const { perigee, apogee, i } = target;
+      select.add(new Option(`${perigee.toFixed(0)} × ${apogee.toFixed(0)} km, ${i.toFixed(1)}°`, k));
+    });
+    select.addEventListener("change", () => this.aimAt(this.optima[Number(select.value)].target));
   }
 
   // -------------------------------------------------------------------------------------------------------------------
@@ -56,6 +68,10 @@ class AscentPage {
   // -------------------------------------------------------------------------------------------------------------------
 
   makeSliders() {
+    if (this.data.optima) {
+      this.makeTargetSliders();
+      return;
+    }
     this.sliders = this.data.sliders.map((slider) => {
       const label = document.createElement("label");
       label.innerHTML = `<span>${slider.label}</span><input type="range"><output></output>`;
@@ -73,6 +89,73 @@ class AscentPage {
       this.readSliders();
     });
     this.showSliders();
+  }
+
+  makeTargetSliders() {
+    this.sliders = this.data.sliders.map((slider) => {
+      const { name, label, range, value, step, logarithmic } = slider;
+      const [place, number] = logarithmic ? [Math.log, Math.exp] : [Number, Number];
+      const row = document.createElement("label");
+      row.innerHTML = `<span>${label}</span><input type="range"><output></output>`;
+      const input = row.querySelector("input");
+      const [min, max] = range.map(place);
+      Object.assign(input, { id: name, min, max, step, value: place(value) });
+      input.addEventListener("input", () => this.readTarget());
+      this.element("sliders").appendChild(row);
+      return { ...slider, input, place, number, output: row.querySelector("output") };
+    });
+    this.element("reset").addEventListener("click", () => {
+      this.sliders.forEach(({ input, place, value }) => {
+        input.value = place(value);
+      });
+      this.changes.target = null;
+      this.showTarget(this.sliders.map(({ value }) => value));
+      this.flySoon();
+    });
+    this.showTarget(this.sliders.map(({ value }) => value));
+  }
+
+  // Put the sliders to a target.
+  aimAt(target) {
+    this.sliders.forEach(({ name, input, place }) => {
+      input.value = place(target[name]);
+    });
+    this.changes.target = { ...target };
+    this.showTarget(this.sliders.map(({ name }) => target[name]));
+    this.flySoon();
+  }
+
+  readTarget() {
+    const values = this.sliders.map(({ input, number }) => number(Number(input.value)));
+    this.changes.target = Object.fromEntries(this.sliders.map(({ name }, k) => [name, values[k]]));
+    this.showTarget(values);
+    this.flySoon();
+  }
+
+  showTarget(values) {
+    this.sliders.forEach(({ output, unit }, k) => {
+      output.textContent = `${values[k].toFixed(unit === "km" ? 0 : 1)} ${unit}`;
+    });
+  }
+
+  // The optimum to show: that of the rocket's own orbit, or of the stored target that is nearest to the chosen one.
+  chooseOptimum() {
+    const { target } = this.changes;
+    if (!target) {
+      this.optimum = storedFlight(this.data.optimum, this.data.rocket);
+      this.element("stored").value = "";
+      this.element("nearest").textContent = "The optimum shown is that of this orbit.";
+      return;
+    }
+    const away = (other) => Math.hypot(Math.log(other.apogee / target.apogee), (other.i - target.i) / 6);
+    const order = this.optima.map((_, k) => k).sort((j, k) => away(this.optima[j].target) - away(this.optima[k].target));
+    const { target: nearest, flight } = this.optima[order[0]];
+    this.optimum = flight;
+    this.element("stored").value = order[0];
+    const isThis = this.sliders.every(({ name }) => Math.abs(nearest[name] - target[name]) < 1e-9);
+    this.element("nearest").textContent = isThis
+      ? "The optimum shown is that of this orbit."
+      : "The optimum shown is that of the nearest stored orbit, which this list names. Choose it to compare.";
   }
 
   readSliders() {
@@ -94,6 +177,9 @@ class AscentPage {
   }
 
   prepareFailure() {
+    if (this.data.optima) {
+      return;
+    }
     const select = this.element("engines");
     this.rocket.groups.forEach(({ name, thrust }, g) => {
       if (thrust > 0) {
@@ -109,6 +195,9 @@ class AscentPage {
 
   // Only engines that burn now can lose thrust.
   showFailure() {
+    if (this.data.optima) {
+      return;
+    }
     const select = this.element("engines");
     const options = [...select.options];
     options.forEach((option) => {
@@ -163,9 +252,15 @@ class AscentPage {
   }
 
   fly() {
+    if (this.data.optima) {
+      this.chooseOptimum();
+      const { target } = this.changes;
+      this.rocket = target ? withTarget(this.data.rocket, target) : this.data.rocket;
+      this.scene.setRocket(this.rocket);
+    }
     this.vehicle = vehicleOf(this.rocket, this.changes);
     this.flights = { ...flyAll(this.data, this.changes), optimum: this.optimum };
-    this.end = Math.max(...NAMES.map((name) => this.flights[name].t[this.flights[name].t.length - 1]));
+    this.end = Math.max(...this.names.map((name) => this.flights[name].t[this.flights[name].t.length - 1]));
     this.element("time").max = Math.ceil(10 * this.end) / 10;
     this.scene.setFlights(this.flights);
     this.showEnd();
@@ -184,7 +279,7 @@ class AscentPage {
 
   showNow() {
     const { Re } = this.rocket;
-    const states = NAMES.map((name) => stateAt(this.flights[name], this.time));
+    const states = this.names.map((name) => stateAt(this.flights[name], this.time));
     const rows = [
       ["altitude (km)", (y) => ((norm(y) - Re) / 1e3).toFixed(3)],
       ["speed (km/s)", (y) => (norm(y.slice(3, 6)) / 1e3).toFixed(4)],
@@ -200,7 +295,7 @@ class AscentPage {
 
   showEnd() {
     const { rocket } = this;
-    const flights = NAMES.map((name) => this.flights[name]);
+    const flights = this.names.map((name) => this.flights[name]);
     const last = (flight) => flight.y[flight.y.length - 1];
     const target = elementsOf(targetState(rocket), rocket);
     const ofOrbit = (label, key, digits) => [
@@ -224,7 +319,7 @@ class AscentPage {
   drawCharts() {
     const { Re } = this.rocket;
     const looks = { policy: { width: 2.2 }, optimum: { dash: [6, 4] }, openLoop: { width: 1 }, lqr: { width: 1 } };
-    const order = ["openLoop", "lqr", "policy", "optimum"];
+    const order = ["openLoop", "lqr", "policy", "optimum"].filter((name) => this.names.includes(name));
     const altitudes = order.map((name) => {
       const { t, y } = this.flights[name];
       return { x: t, y: y.map((state) => (norm(state) - Re) / 1e3), color: COLORS[name], ...looks[name] };
@@ -237,6 +332,14 @@ class AscentPage {
     this.altitude.draw({ ...content, yRange: rangeOf(altitudes.map(({ y }) => y)), lines: altitudes });
     this.pitch.draw({ ...content, yRange: rangeOf(pitches.map(({ y }) => y)), lines: pitches });
   }
+}
+
+// A flight of the page's data, with its error from the target of `rocket`.
+function storedFlight({ t, u, y }, rocket) {
+  const rows = (array) => Array.from({ length: array.shape[0] }, (_, k) => Array.from(rowOf(array, k)));
+  const flight = { t: Array.from(t.values), u: rows(u), y: rows(y) };
+  const last = flight.y[flight.y.length - 1];
+  return { ...flight, errorNorm: Math.hypot(...terminalError(last, rocket)) };
 }
 
 function number(value, digits) {

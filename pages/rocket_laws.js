@@ -17,7 +17,27 @@ function observationOf(ascent, options, changes) {
   const clock = options.observe_phase ? [left, phase] : [0, 0];
   const scores = rocket.scores.map(({ of, sigma }) => (of && sigma ? changes[of] / sigma : 0));
   const draw = options.observe_draw ? scores : [];
-  return [...ascent.y.slice(0, 6), mass, ...clock, ...draw];
+  const target = rocket.targets ? toldTarget(rocket) : [];
+  return [...ascent.y.slice(0, 6), mass, ...clock, ...target, ...draw];
+}
+
+// What a flight shows of its own target: unit vectors to the perigee and normal to the plane, momentum, eccentricity.
+function toldTarget({ axes, h_target, e }) {
+  return [...axes[0], ...axes[2], norm(h_target), e];
+}
+
+const TOLD = 8; // such numbers
+
+// `target_of` of the script: the target's axes, angular momentum and eccentricity vector in these axes, mu = 1.
+function targetOf(observation, constants) {
+  const { units, axes, h_target, e_target, sees_target } = constants;
+  if (!sees_target) {
+    return { axes: [0, 1, 2].map((k) => rowOf(axes, k)), h: h_target.values, e: e_target.values };
+  }
+  const told = observation.slice(9, 9 + TOLD);
+  const [perigee, normal] = [told.slice(0, 3), told.slice(3, 6)];
+  const momentum = told[6] / (units.values[0] * units.values[3]);
+  return { axes: [perigee, cross(normal, perigee), normal], h: [0, 0, momentum], e: [told[7], 0, 0] };
 }
 
 // The flight computer's mass: the nominal burn's, counted from the staging that has just been.
@@ -30,27 +50,29 @@ function computedMass(ascent) {
 
 // `motion` of the script: what follows from position and velocity, lengths in Earth radii, mu = 1.
 function motionOf(observation, constants) {
-  const { units, axes, h_target, e_target } = constants;
+  const { units } = constants;
+  const target = targetOf(observation, constants);
   const scaledBy = observation.slice(0, 7).map((value, k) => value / units.values[k]);
-  const inAxes = (vector) => [0, 1, 2].map((k) => dot(rowOf(axes, k), vector));
+  const inAxes = (vector) => target.axes.map((axis) => dot(axis, vector));
   const r = inAxes(scaledBy.slice(0, 3));
   const v = inAxes(scaledBy.slice(3, 6));
   const radius = norm(r);
   const speed = norm(v);
   const h = cross(r, v);
   const e = sum(cross(v, h), scaled(r, -1 / radius));
-  const size = norm(h_target.values);
+  const size = norm(target.h);
   return {
     r,
     v,
+    target,
     altitude: 64 * (radius - 1), // 100 km
     climb: (8 * dot(r, v)) / radius, // km/s
     outOfPlane: [64 * r[2], 8 * v[2]],
     speed,
     energy: (speed * speed) / 2 - 1 / radius,
     error: [
-      ...h.map((value, k) => (value - h_target.values[k]) / size),
-      ...e.map((value, k) => value - e_target.values[k]),
+      ...h.map((value, k) => (value - target.h[k]) / size),
+      ...e.map((value, k) => value - target.e[k]),
     ],
     logMass: Math.log(scaledBy[6]),
     angle: Math.atan2(r[1], r[0]),
@@ -60,7 +82,11 @@ function motionOf(observation, constants) {
 // `features` of the script, in its order.
 function rocketFeatures(constants, observation) {
   const motion = motionOf(observation, constants);
-  const [timeLeft, phase, ...draw] = observation.slice(7);
+  const [timeLeft, phase] = observation.slice(7);
+  const draw = observation.slice(constants.sees_target ? 9 + TOLD : 9);
+  const last = constants.sees_target
+    ? [...toTheTarget(motion), ...draw]
+    : [...draw, ...differencesOf(constants, motion, phase)];
   const oneHot = Array.from(constants.phases.values, (other) => (Math.abs(phase - other) < 1e-3 ? 1 : 0));
   return [
     ...motion.r,
@@ -74,10 +100,35 @@ function rocketFeatures(constants, observation) {
     ...oneHot,
     ...motion.error,
     ...motion.error.map((value) => Math.tanh(10 * value)),
-    ...draw,
-    ...differencesOf(constants, motion, phase),
+    ...last,
   ];
 }
+
+// `to_the_target` of the script.
+function toTheTarget({ r, v, speed, target }) {
+  const [momentum, eccentricity] = [target.h[2], target.e[0]];
+  const energy = (eccentricity * eccentricity - 1) / (2 * momentum * momentum);
+  const perigee = (momentum * momentum) / (1 + eccentricity);
+  const missing = Math.sqrt(Math.max(2 * (energy + 1 / norm(r)), 0)) - speed;
+  const inPlane = Math.hypot(r[0], r[1]);
+  const tooHigh = inPlane - (momentum * momentum) / (1 + (eccentricity * r[0]) / inPlane);
+  const tooFast = (r[0] * v[0] + r[1] * v[1]) / inPlane - (eccentricity * r[1]) / (inPlane * momentum);
+  const left = Math.abs(missing) + LAST_STEP;
+  const toMakeUp = [tooHigh / (left * left), r[2] / (left * left), tooFast / left, v[2] / left];
+  return [
+    8 * (momentum - 1),
+    eccentricity,
+    64 * (perigee - 1),
+    energy,
+    missing,
+    Math.log1p(Math.max(missing, 0) / 0.01) / 5,
+    64 * tooHigh,
+    8 * tooFast,
+    ...toMakeUp.map((value) => Math.asinh(2 * value)),
+  ];
+}
+
+const LAST_STEP = 0.004; // of the circular speed: about what the last stage gains in a step
 
 // What the flight differs by from the nominal one at the same phase and energy, in its own units and clipped;
 // zeros where the policy has no nominal flight.
@@ -130,6 +181,7 @@ function countWhile(length, holds) {
 // The policy as a law of `flyAscent`. Its mean is a direction as up, along-track and cross-track.
 function policyLaw(policy, changes) {
   const network = new Network(policy);
+  network.constants.sees_target = policy.sees_target;
   return (ascent) => {
     const observation = observationOf(ascent, policy.options, changes);
     const local = unit(network.step(rocketFeatures(network.constants, observation)));
@@ -187,10 +239,15 @@ function placeIn(sorted, value) {
   return low + (value - sorted[low]) / (sorted[high] - sorted[low]);
 }
 
-// All flights of a vehicle with these changes (`vehicleOf`): policy, open loop, LQR.
+// All flights of a vehicle with these changes (`vehicleOf`): policy, open loop, LQR. To a target of its own (`changes`
+// has one) the policy flies alone.
 function flyAll(data, changes) {
-  const { rocket, optimum, policy } = data;
+  const { optimum, policy } = data;
+  const rocket = changes.target ? withTarget(data.rocket, changes.target) : data.rocket;
   const vehicle = vehicleOf(rocket, changes);
+  if (rocket.targets) {
+    return { policy: flyAscent(rocket, vehicle, policyLaw(policy, changes)) };
+  }
   return {
     policy: flyAscent(rocket, vehicle, policyLaw(policy, changes)),
     openLoop: flyAscent(rocket, vehicle, openLoop(optimum)),

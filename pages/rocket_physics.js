@@ -206,6 +206,37 @@ function terminalError(y, rocket) {
   return [...ofMomentum, ...e.map((value, k) => value - rocket.e_target[k])];
 }
 
+// The target at these changes {perigee, apogee (km), i, argp (degrees off its natural place)}, as `Targets.at` of
+// rocket/targets.py: a rocket with this orbit. The plane is that through the launch site.
+function withTarget(rocket, { perigee, apogee, i, argp }) {
+  const { latitude, goes_south, own_argp_from_site } = rocket.targets;
+  const radians = (degrees) => (degrees * Math.PI) / 180;
+  const highest = Math.max(apogee, perigee);
+  const [low, high] = [rocket.Re + 1e3 * perigee, rocket.Re + 1e3 * highest];
+  const [a, e] = [(low + high) / 2, (high - low) / (high + low)];
+  const ofPlane = (ratio) => Math.asin(clamp(ratio, -1, 1));
+  const north = -ofPlane(Math.tan(radians(latitude)) / Math.tan(radians(i)));
+  const above = ofPlane(Math.sin(radians(latitude)) / Math.sin(radians(i)));
+  const [raan, site] = goes_south ? [Math.PI - north, Math.PI - above] : [north, above];
+  return { ...rocket, ...orbitOf(rocket, a, e, radians(i), raan, site + radians(own_argp_from_site + argp)) };
+}
+
+// What a target orbit's elements (m and rad) make of a rocket's constants.
+function orbitOf(rocket, a, e, i, raan, argp) {
+  const [cosNode, sinNode, cosI, sinI] = [Math.cos(raan), Math.sin(raan), Math.cos(i), Math.sin(i)];
+  const normal = [sinNode * sinI, -cosNode * sinI, cosI];
+  const [cos, sin] = [Math.cos(argp), Math.sin(argp)];
+  const perigee = [cosNode * cos - sinNode * sin * cosI, sinNode * cos + cosNode * sin * cosI, sin * sinI];
+  return {
+    a,
+    e,
+    axes: [perigee, cross(normal, perigee), normal],
+    h_target: scaled(normal, Math.sqrt(rocket.mu * a * (1 - e * e))),
+    e_target: scaled(perigee, e),
+    target_energy: -rocket.mu / (2 * a),
+  };
+}
+
 // Unit vectors up, along-track and cross-track at r, in the frame of the target's plane.
 function localFrame(y, normal) {
   const up = unit(y);

@@ -19,10 +19,11 @@ class Scene {
     this.world = new THREE.Scene();
     this.earth = this.makeEarth();
     this.world.add(this.earth);
-    this.world.add(makeLine(this.orbitPoints(targetState(this.rocket)), LIGHT.target));
     this.paths = {};
     this.dots = {};
-    for (const name of ["openLoop", "lqr", "policy", "optimum"]) {
+    this.setRocket(data.rocket);
+    const laws = data.optima ? [] : ["openLoop", "lqr"];
+    for (const name of [...laws, "policy", "optimum"]) {
       this.dots[name] = new THREE.Mesh(
         new THREE.SphereGeometry(1, 16, 12),
         new THREE.MeshBasicMaterial({ color: LIGHT[name] }),
@@ -88,6 +89,17 @@ class Scene {
 
   place(y) {
     return scaled(y, 1 / this.rocket.Re);
+  }
+
+  // Show the target orbit of this rocket.
+  setRocket(rocket) {
+    this.rocket = rocket;
+    if (this.target) {
+      this.world.remove(this.target);
+      this.target.geometry.dispose();
+    }
+    this.target = makeLine(this.orbitPoints(targetState(rocket)), LIGHT.target);
+    this.world.add(this.target);
   }
 
   // Show these flights, by name.

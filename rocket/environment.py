@@ -30,6 +30,7 @@ from common.batch import (
 from common.errors import BadInput, is_finite, refuse_unless
 from common.flying import fly_until_ended
 from common.registration import say_remarks
+from rocket.aim import OBSERVED_TARGET, aim_at
 from rocket.dispersion import (
     DISPERSION,
     LARGEST_DISPERSION,
@@ -46,15 +47,7 @@ from rocket.flight import Fleet, Steps, cut_off, fly_step, steps_at, steps_until
 from rocket.missions import PAPER_MISSION, ROCKETS, Mission
 from rocket.navigation import LARGEST_SCORE as LARGEST_NOISE_SCORE
 from rocket.navigation import OBSERVED, checked_noise, deviations
-from rocket.orbits import (
-    final_elements,
-    local_frame,
-    orbit_vectors,
-    specific_energy,
-    target_axes,
-    target_orbit,
-    terminal_error,
-)
+from rocket.orbits import components, final_elements, local_frame, orbit_vectors, specific_energy, terminal_error
 from rocket.rewards import (
     REFERENCE_PITCH,
     TERMINAL_SCALE,
@@ -64,9 +57,11 @@ from rocket.rewards import (
     precision_points,
     terminal_reward,
 )
+from rocket.targets import ELEMENTS, own_target
 from rocket.vehicle import Rocket, delta_v
 
 ACTION_FRAMES = ("eci", "local")
+ALWAYS_SEEN = 9  # numbers: r, v, m, t_norm and phi
 
 
 @dataclass(frozen=True)
@@ -118,6 +113,11 @@ class RocketVectorEnv(BatchedEnv):
     stream, so the draws are the same without it. `reset(options={"noise": w})` gives the standard scores w (N, T, 6) of
     `episode_steps` + 1 or more observations.
 
+    With a mission that has `targets` each flight, or each group, flies to an orbit of its own: five elements, a in m
+    and angles in degrees, drawn from the mission's `Targets`. `reset(options={"target": elements})` gives them, (5,) or
+    (N, 5). Eight numbers follow phi in the observation: the unit vectors to the target's perigee and normal to its
+    plane, its angular momentum (m^2/s) and eccentricity. Wherever this text says target, it is the flight's own.
+
     With a `cutoff` mission (ours; the paper fixes the final time) the engine stops when the energy reaches the target's
     in the last phase. The moment is found within the step, to 1e-10, and ends the episode.
 
@@ -133,6 +133,7 @@ class RocketVectorEnv(BatchedEnv):
     - `a_km e i_deg raan_deg argp_deg final_mass_kg final_time_s`
     - `max_altitude_km`, of the steps' ends
     - the sums of the five parts, `episodic_return`, `points` (`precision_points`) and `crashed`
+    - with targets `target` (N, 5)
     - with dispersion or failures `draw` (N, k), and `dry` for a flight that is out of fuel
     - with failures `failure` (N, 3): group of engines, moment (s) and share lost; -1, 0, 0 for a healthy flight
 
@@ -166,11 +167,13 @@ class RocketVectorEnv(BatchedEnv):
         number = isinstance(dispersion, int | float | np.number) and 0 <= dispersion <= LARGEST_DISPERSION
         refuse_unless(number, "dispersion", dispersion, f"must be a number from 0 to {LARGEST_DISPERSION:.0f}")
         check_failure(failure, failure_time, mission.cutoff)
+        one_orbit = "must be 0 where flights have targets of their own"
+        refuse_unless(not failure or mission.targets is None, "failure", failure, one_orbit)
         self.mission = flown_mission(mission, table_isp=table_isp)
         self.has_draws = bool(dispersion or failure)  # whether flights differ from the table and from one another
         if self.has_draws:
             check_drawable(self.mission.rocket)
-        self.rocket, self.cutoff = self.mission.rocket, mission.cutoff
+        self.rocket, self.cutoff, self.targets = self.mission.rocket, mission.cutoff, mission.targets
         self._last_phase = len(self.rocket.burns) - 1
         self._coasts = np.array([burn.is_coast for burn in self.rocket.burns])  # by phase
         self._has_coasts = bool(self._coasts.any())
@@ -189,10 +192,10 @@ class RocketVectorEnv(BatchedEnv):
         super().__init__(num_envs, 1, *self._spaces(), render_mode, autoreset_mode)
         self._build()
         self._make_clock()
-        self._axes = target_axes(self.rocket)
-        h, e = target_orbit(self.rocket.target, self.rocket.mu)
-        self._h_axes = self._axes / np.linalg.norm(h)
-        self._target = np.concatenate([self._h_axes @ h, self._axes @ e])[:, None]
+        self.target = np.zeros((num_envs, 0))  # (N, 5) where flights have their own
+        if self.targets is not None:
+            self.target = np.repeat(own_target(self.rocket)[None], num_envs, axis=0)
+        self._set_aim()
         self.y = np.repeat(self.rocket.x0[:, None], num_envs, axis=1)  # (7, N)
         self.u = np.zeros((3, num_envs))  # the direction of the step before, in ECI
         self._parts = np.zeros((len(self.PARTS), num_envs))
@@ -200,6 +203,10 @@ class RocketVectorEnv(BatchedEnv):
         self._crashed = np.zeros(num_envs, dtype=bool)
         self._coasted = np.zeros(num_envs, dtype=bool)  # in the step before
         self._everyone = np.arange(num_envs)
+
+    def _set_aim(self):
+        """Set what flights are compared with, by their targets."""
+        self._aim = aim_at(self.rocket, None if self.targets is None else self.target)
 
     def _build(self):
         """Make the vehicles, which are all nominal until an episode draws its own."""
@@ -231,11 +238,15 @@ class RocketVectorEnv(BatchedEnv):
         if self.has_draws:
             latest = max(self._largest.burn_out.max(), latest)
         r_max, v_max = reachable(self.rocket, self.dispersion, latest)
+        self._largest_momentum = r_max * v_max
+        target = [] if self.targets is None else [*[1.0] * 6, self._largest_momentum, 1.0]
         scores = self._draw_bounds if self.observe_draw else []
-        high = np.array([*[r_max] * 3, *[v_max] * 3, self._largest.mass[0], 1.0, 1.0, *scores])
+        high = np.array([*[r_max] * 3, *[v_max] * 3, self._largest.mass[0], 1.0, 1.0, *target, *scores])
         high[:OBSERVED] += LARGEST_NOISE_SCORE * deviations(self.navigation_noise)
         low = -high
         low[6:9] = 0.0, min(0.0, 1 - latest / self.rocket.end_time), 0.0
+        if target:
+            low[15:17] = 0.0
         return Box(low, high, dtype=np.float64), Box(-1.0, 1.0, (3,), dtype=np.float64)
 
     def _make_clock(self):
@@ -256,7 +267,12 @@ class RocketVectorEnv(BatchedEnv):
 
     def _start(self, mask, options):
         taken = ["draw"] * self.has_draws + ["noise"] * bool(self.navigation_noise)
-        self.refuse_options(options, taken, "a rocket has none without dispersion, failure or navigation noise")
+        taken += ["target"] * (self.targets is not None)
+        self.refuse_options(
+            options, taken, "a rocket has none without targets, dispersion, failure or navigation noise"
+        )
+        if self.targets is not None:
+            self._aim_anew(mask, options.get("target"))
         if self.has_draws:
             self._launch(mask, options.get("draw"))
         if self.navigation_noise:
@@ -283,6 +299,42 @@ class RocketVectorEnv(BatchedEnv):
         for mine, new in zip(self.vehicles, drawn):
             mine[..., mask] = new
         self.episode_steps = max(self.episode_steps, int(self._set_ends(self.vehicles).max()))
+
+    def _aim_anew(self, mask, given):
+        """Set the targets of the environments in `mask`, by the given ones (N, 5) or (5,), or by new ones."""
+        if given is None:
+            targets = self._draw_starts(self._new_targets, int(mask.sum()))
+        else:
+            targets = self._checked_targets(given)[mask]
+        self.target[mask] = targets
+        self._set_aim()
+
+    def _new_targets(self, n):
+        """New targets (n, 5). Those of groups come in pairs, from opposite ends of the ranges."""
+        if self.training.flights_per_start == 1:
+            return self.targets.at(self.np_random.random((n, len(ELEMENTS))), self.rocket)
+        half = self.np_random.random((-(-n // 2), len(ELEMENTS)))
+        shares = np.stack([half, 1 - half], axis=1).reshape(-1, len(ELEMENTS))[:n]
+        return self.targets.at(shares, self.rocket)
+
+    def _checked_targets(self, given):
+        """The targets given to `reset`, one or each flight's own, as (N, 5). Raises BadInput for one that cannot be."""
+        shapes = [(len(ELEMENTS),), (self.num_envs, len(ELEMENTS))]
+        allowed = f"must hold finite numbers, of shape {' or '.join(map(str, shapes))}: {', '.join(ELEMENTS)}"
+        targets = given_numbers("target", given, lambda shape: shape in shapes, allowed)
+        targets = np.broadcast_to(targets, shapes[1])
+        a, e, i, _, _ = targets.T
+        momentum = np.sqrt(np.maximum(self.rocket.mu * a * (1 - e * e), 0.0))
+        checks = [
+            ("a", (a > 0) & (momentum <= self._largest_momentum), "must be positive, and that of a reachable orbit"),
+            ("e", (e >= 0) & (e < 1), "must be at least 0 and below 1, a closed orbit"),
+            ("a", a * (1 - e) > self.rocket.Re, f"must have its perigee above the ground, {self.rocket.Re} m"),
+            ("i", (i >= 0) & (i <= 180), "must be between 0 and 180 degrees"),
+        ]
+        for name, possible, allowed in checks:
+            value = targets[~possible, ELEMENTS.index(name)][:1].sum()
+            refuse_unless(possible.all(), f"{name} of options['target']", value, allowed)
+        return targets
 
     @property
     def generators(self) -> dict[str, np.random.Generator]:
@@ -351,7 +403,9 @@ class RocketVectorEnv(BatchedEnv):
     def _progress(self):
         """The distance L (N,) to the target orbit (see `orbital_reward`)."""
         h, e = orbit_vectors(self.y, self.rocket.mu)
-        error = np.concatenate([self._h_axes @ h, self._axes @ e]) - self._target
+        error = (
+            np.concatenate([components(self._aim.momentum_axes, h), components(self._aim.axes, e)]) - self._aim.orbit
+        )
         return np.abs(error).sum(axis=0)
 
     def _observe(self):
@@ -359,8 +413,10 @@ class RocketVectorEnv(BatchedEnv):
         obs[:, :7] = self.y.T
         if self.navigation_noise:
             obs[:, :OBSERVED] += deviations(self.navigation_noise) * self._noise[self._everyone, self.t]
+        if self._aim.seen is not None:
+            obs[:, ALWAYS_SEEN : ALWAYS_SEEN + OBSERVED_TARGET] = self._aim.seen
         if self.observe_draw:
-            obs[:, 9:] = self.draw[:, : self._scores_drawn]
+            obs[:, -self._scores_drawn :] = self.draw[:, : self._scores_drawn]
         if self.has_draws and not self.observe_mass:
             obs[:, 6] = self._computed_mass()
         phi = self.phase / max(self._last_phase, 1)
@@ -401,7 +457,7 @@ class RocketVectorEnv(BatchedEnv):
         u = unit_directions(actions)
         if self.action_frame == "eci":
             return u
-        up, along, cross = local_frame(self.y, self._axes[2])
+        up, along, cross = local_frame(self.y, self._aim.axes[2])
         return up * u[0] + along * u[1] + cross * u[2]
 
     def _advance(self, actions):
@@ -416,10 +472,11 @@ class RocketVectorEnv(BatchedEnv):
         self.y = fly_step(fleet, before, u, steps, duration)
         if self.cutoff:
             energy = specific_energy(self.y, self.rocket.mu)
-            reached = (phase == self._last_phase) & (energy >= self.rocket.target_energy)
+            reached = (phase == self._last_phase) & (energy >= self._aim.energy)
             if reached.any():
                 ends = before[:, reached], self.y[:, reached]
-                cut = cut_off(fleet, *ends, u[:, reached], steps.of(reached), duration[reached])
+                energy = np.broadcast_to(self._aim.energy, reached.shape)[reached]
+                cut = cut_off(fleet, *ends, u[:, reached], steps.of(reached), duration[reached], energy)
                 self.y[:, reached], duration[reached] = cut
             done = done | reached
         altitude = np.sqrt((self.y[:3] ** 2).sum(axis=0)) - self.rocket.Re
@@ -451,26 +508,32 @@ class RocketVectorEnv(BatchedEnv):
             until = self.mission.guided_until or self.rocket.burns[0].end
             times, angles = REFERENCE_PITCH
             pitch = np.radians(np.interp(self.rocket.dt * t, until * np.array(times), angles, right=np.nan))
-            parts[2] = guidance_reward(u, *local_frame(before, self._axes[2])[:2], pitch)
+            parts[2] = guidance_reward(u, *local_frame(before, self._aim.axes[2])[:2], pitch)
         left = np.minimum(self.y[6] - self.vehicles.dry_mass, self.vehicles.propellant)
         parts[3] = penalties(self.mission, altitude, self.time, turn, burnt, left, self.training.propellant_price)
         self._parts += parts
         if done.any():
-            error_norm = np.linalg.norm(terminal_error(self.y[:, done].T, self.rocket), axis=1)
+            error_norm = np.linalg.norm(self._terminal_error()[done], axis=1)
             self._parts[4, done] += terminal_reward(error_norm)
             parts[4, done] = terminal_reward(error_norm, self.training.terminal_scale)
         self._distance = distance
         return parts.sum(axis=0)
 
+    def _terminal_error(self):
+        """`terminal_error` (N, 6) from each flight's target."""
+        return terminal_error(self.y.T, self.rocket, self._aim.elements)
+
     def _final_info(self):
         y = self.y.T
-        error = terminal_error(y, self.rocket)
+        error = self._terminal_error()
         error_norm = np.sqrt((error * error).sum(axis=1))
         info = {"final_y": y.copy(), "error": error, "error_norm": error_norm, **final_elements(y, self.rocket)}
         info |= {"final_mass_kg": self.y[6].copy(), "final_time_s": self.time.copy(), "crashed": self._crashed.copy()}
         info |= {"max_altitude_km": self._max_altitude / 1e3, "points": precision_points(error_norm)}
         if self.has_draws:
             info |= {"draw": self.draw.copy(), "dry": self.time >= self.vehicles.burn_out - 1e-6}
+        if self.targets is not None:
+            info["target"] = self.target.copy()
         if self.failure:
             info["failure"] = self.vehicles.failure.T.copy()
         return info | dict(zip(self.PARTS, self._parts.copy())) | {"episodic_return": self._parts.sum(axis=0)}
@@ -541,19 +604,28 @@ def make_rocket(env_id: str, **options) -> RocketEnv:
 
 
 def fly_rocket(
-    env_id: str, policy: Callable, end_time: float | None = None, draw=None, noise: Callable | None = None, **options
+    env_id: str,
+    policy: Callable,
+    end_time: float | None = None,
+    draw=None,
+    noise: Callable | None = None,
+    target=None,
+    **options,
 ) -> dict:
     """Fly `policy(obs (1, obs), t) -> action (1, 3)` once, to `end_time` (s) at the latest, and record the flight.
 
     - draw (k,): the standard scores of the vehicle and its failure, with the options `dispersion` and `failure`
     - noise(T): gives the standard scores (1, T, 6) of the observations, with the option `navigation_noise`; without it
       they are random
+    - target (5,): where flights have targets of their own; without it, it is the rocket's own orbit
 
     Returns t (K+1,) s, u (K, 3) unit directions in ECI, y (K+1, 7) with r, v and m, reward (K,), the sums so far of
     `PARTS` as `parts` (K, 5), and the entries of the last step's `final_info`.
     """
     env: Any = gym.make_vec(env_id, num_envs=1, end_time=end_time, **options)  # a RocketVectorEnv
     given = {} if draw is None else {"draw": [draw]}
+    if env.targets is not None:
+        given["target"] = own_target(env.rocket) if target is None else target
     if noise is not None and env.navigation_noise:
         given["noise"] = noise(env.episode_steps + 1)
     obs, _ = env.reset(options=given)

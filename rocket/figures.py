@@ -11,7 +11,7 @@ from matplotlib.patches import Circle, Rectangle
 
 from drawing.style import BOUNDARY, OPTIMUM, POLICY, TARGET, TARGET_ORBIT
 from rocket.losses import STANDARD
-from rocket.metrics import BOX, altitude_km, element_misses, wilson
+from rocket.metrics import BOX, altitude_km, apsides, element_misses, wilson
 from rocket.missions import Mission
 from rocket.orbits import final_elements, local_frame, orbit_vectors, target_axes, target_orbit
 from rocket.vehicle import Rocket
@@ -200,7 +200,9 @@ def dispersed_figure(rocket: Rocket, flights: dict[str, dict], title: str) -> Fi
     labels |= {"raan_deg": "right ascension of the node (deg)", "argp_deg": "argument of perigee (deg)"}
     for ax, (x, y) in zip(scatters, (("argp_deg", "perigee_km"), ("raan_deg", "i_deg"))):
         for label, arrays in flights.items():
-            misses = element_misses(final_elements(arrays["final_y"], rocket), rocket)
+            ends = final_elements(arrays["final_y"], rocket)
+            ends |= {key: arrays[key] for key in ("target",) if key in arrays}
+            misses = element_misses(ends, rocket)
             across = misses.get(x, np.zeros(len(arrays["final_y"])))
             ax.plot(across, misses[y], ".", markersize=3, alpha=0.5, label=label)
         ax.add_patch(Rectangle((-BOX[x], -BOX[y]), 2 * BOX[x], 2 * BOX[y], fill=False, **TARGET))
@@ -216,6 +218,32 @@ def dispersed_figure(rocket: Rocket, flights: dict[str, dict], title: str) -> Fi
     handles.append(Line2D([], [], **TARGET))
     figure.legend(handles, [*names, "a launcher's accuracy"], loc="outside lower center", ncols=min(len(handles), 5))
     figure.suptitle(title)
+    return figure
+
+
+def targets_figure(rocket: Rocket, arrays: dict, title: str) -> Figure:
+    """||error|| and the mass that is missing, over the targets' apogee and inclination. The worst are named.
+
+    `arrays` are those of `evaluate_targets`. The missing mass is in percent of the optimum's, where it is known.
+    """
+    figure = Figure(figsize=(13, 8), layout="constrained")
+    a, e, i, _, _ = arrays["target"].T
+    apogee = apsides(a / 1e3, e, rocket)["apogee_km"]
+    errors = np.linalg.norm(arrays["final_error"], axis=1)
+    missing = 100 * (1 - arrays["final_y"][:, 6] / arrays["best_mass"])
+    rows = (("$\\Vert$error$\\Vert$", errors, "log"), ("mass less than the optimum's (%)", missing, "linear"))
+    for axes, (label, values, scale) in zip(figure.subplots(2, 2), rows):
+        known = np.flatnonzero(np.isfinite(values))
+        for ax, across, name in zip(
+            axes, (apogee, i), ("apogee of the target (km)", "inclination of the target (deg)")
+        ):
+            ax.plot(across[known], values[known], ".", markersize=3, alpha=0.5)
+            ax.set(xlabel=name, ylabel=label, yscale=scale)
+            ax.grid(alpha=0.3)
+            for k in known[np.argsort(values[known])[-3:]]:
+                ax.annotate(f"{k}", (across[k], values[k]), xytext=(4, 2), textcoords="offset points", fontsize=8)
+        axes[0].set(xscale="log")
+    figure.suptitle(f"{title}. Numbers are those of the worst targets, from 0")
     return figure
 
 

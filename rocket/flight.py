@@ -129,18 +129,18 @@ def fly_arc(fleet: Fleet, y, u, steps: Steps, dt):
     return y_next
 
 
-def cut_off(fleet: Fleet, before, after, u, steps: Steps, duration):
+def cut_off(fleet: Fleet, before, after, u, steps: Steps, duration, target_energy):
     """The states (7, n) and times (n,), in s after the begin of the steps, at which the energy is the target's.
 
     before and after (7, n) are the states at the begin and `duration` (n,) s later, when the energy has been passed.
-    The method is regula falsi with the Illinois change (Dowell and Jarratt, 1971): if the same end of the bracket is
-    replaced twice, the other end's value is halved. The energy grows almost linearly in a step, so four evaluations
-    reach rounding. All rows take six, so that no row depends on the rest of the batch.
+    The target_energy (J/kg) is one for all or (n,). The method is regula falsi with the Illinois change (Dowell and
+    Jarratt, 1971): if the same end of the bracket is replaced twice, the other end's value is halved. The energy grows
+    almost linearly in a step, so four evaluations reach rounding. All rows take six, so that no row depends on the rest
+    of the batch.
     """
-    rocket = fleet.rocket
 
     def excess(y):
-        return specific_energy(y, rocket.mu) - rocket.target_energy
+        return specific_energy(y, fleet.rocket.mu) - target_energy
 
     low, high = np.zeros(len(duration)), duration
     f_low = np.minimum(excess(before), -1e-300)  # a flight that begins beyond the energy is cut off there

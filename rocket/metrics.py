@@ -19,6 +19,7 @@ from rocket.environment import RocketVectorEnv
 from rocket.failure import failure_scores
 from rocket.missions import ROCKETS, Mission
 from rocket.navigation import flight_noise
+from rocket.targets import ELEMENTS
 from rocket.vehicle import Rocket
 
 SUCCESS = 0.02  # bound of ||error||, our choice: the paper's "successful orbital insertion" has no bound
@@ -41,6 +42,11 @@ def rocket_metrics(flight: dict, reference: dict, mission: Mission) -> dict:
     metrics |= {key: flight[key] for key in (*RocketVectorEnv.PARTS, "points")}
     metrics = {key: float(value) for key, value in metrics.items() if np.isfinite(value)}
     return metrics | {"success": bool(flight["error_norm"] < SUCCESS), "crashed": bool(flight["crashed"])}
+
+
+def own_flight(arrays: dict) -> dict:
+    """The arrays of an evaluation, where `t` and `u` are those of the flight to the rocket's own orbit."""
+    return arrays | {key: arrays[f"{key}_own"] for key in ("t", "u") if f"{key}_own" in arrays}
 
 
 def flight_summary(flight: dict, mission: Mission) -> dict:
@@ -132,6 +138,17 @@ def chosen(arrays: dict, flights: np.ndarray) -> dict:
     return {key: value[flights] for key, value in arrays.items()}
 
 
+def targets_of(mission: Mission, eval_seed: int, n: int) -> np.ndarray | None:
+    """The n targets (n, 5) of a seed: a (m), e, i, raan, argp (degrees). None where all fly to the rocket's orbit.
+
+    They are the same for every policy and guidance law.
+    """
+    if mission.targets is None:
+        return None
+    shares = np.random.default_rng([eval_seed, 5]).random((n, len(ELEMENTS)))
+    return mission.targets.at(shares, mission.rocket)
+
+
 def evaluate_dispersed(
     env_id: str, policy, eval_seed: int, n: int, dispersion: float, at_once: int = AT_ONCE, **env_options
 ):
@@ -140,18 +157,17 @@ def evaluate_dispersed(
     Returns the `dispersed_...` metrics of eval.json, and the arrays `draw` (n, k), `final_y` (n, 7) with the true mass,
     `final_t` (n,) and `final_error` (n, 6). Flights that crash or run dry are counted, and the errors include them.
     With the option `failure` there is an array `failure` (n, 3) as in `final_info`, and the metrics are those of the
-    healthy flights.
+    healthy flights. Where flights have targets of their own there is an array `target` (n, 5).
     """
-    rocket = env_options.get("rocket") or ROCKETS[env_id].rocket
-    z = draws(rocket, dispersion, eval_seed, n, env_options.get("failure", 0.0))
-    parts = []
-    for first in range(0, n, at_once):
-        batch = range(first, min(first + at_once, n))
-        noise = partial(flight_noise, eval_seed, batch)
-        parts.append(fly_dispersed(env_id, policy, z[batch.start : batch.stop], dispersion, noise, **env_options))
-    flights = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
-    names = ("final_y", "final_t", "final_error", "failure")
-    arrays = {"draw": z} | {key: flights[key] for key in names if key in flights}
+    mission = ROCKETS[env_id]
+    rocket = env_options.get("rocket") or mission.rocket
+    given = {"draw": draws(rocket, dispersion, eval_seed, n, env_options.get("failure", 0.0))}
+    targets = targets_of(mission, eval_seed, n)
+    if targets is not None:
+        given["target"] = targets
+    flights = fly_batches(env_id, policy, eval_seed, given, at_once, dispersion=dispersion, **env_options)
+    names = ("draw", "target", "final_y", "final_t", "final_error", "failure")
+    arrays = {key: flights[key] for key in names if key in flights} | given
     if not dispersion:  # all healthy flights are equal
         return {}, arrays
     flights = chosen(flights, healthy(arrays))
@@ -161,16 +177,33 @@ def evaluate_dispersed(
     return metrics, arrays
 
 
-def fly_dispersed(env_id: str, policy, z: np.ndarray, dispersion: float, noise=None, **env_options) -> dict:
-    """The ends of one batch of flights with the draws z (m, k): `final_info`'s arrays, `final_y` (m, 7) and others.
+def fly_batches(env_id: str, policy, eval_seed: int, given: dict, at_once: int = AT_ONCE, **env_options) -> dict:
+    """The ends of the flights with these options of `reset`, {name: (n, ...)}, in batches of at most `at_once`."""
+    n = len(next(iter(given.values())))
+    parts = []
+    for first in range(0, n, at_once):
+        batch = range(first, min(first + at_once, n))
+        noise = partial(flight_noise, eval_seed, batch)
+        part = {name: values[batch.start : batch.stop] for name, values in given.items()}
+        parts.append(fly_given(env_id, policy, part, noise, **env_options))
+    return {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
 
-    noise(T) gives the standard scores (m, T, 6) of the observations, with the option `navigation_noise`. Without it the
-    scores are random.
+
+def fly_dispersed(env_id: str, policy, z: np.ndarray, dispersion: float, noise=None, **env_options) -> dict:
+    """`fly_given` of one batch of flights with the draws z (m, k)."""
+    return fly_given(env_id, policy, {"draw": z}, noise, dispersion=dispersion, **env_options)
+
+
+def fly_given(env_id: str, policy, given: dict, noise=None, **env_options) -> dict:
+    """The ends of one batch of flights: `final_info`'s arrays, `final_t` (m,) and `final_error` (m, 6).
+
+    `given` are the options of their `reset`, {name: (m, ...)}. noise(T) gives the standard scores (m, T, 6) of the
+    observations, with the option `navigation_noise`. Without it the scores are random.
     """
-    batch: Any = gym.make_vec(env_id, num_envs=len(z), dispersion=dispersion, **env_options)
-    given = {"draw": z}
+    number = len(next(iter(given.values())))
+    batch: Any = gym.make_vec(env_id, num_envs=number, **env_options)
     if noise is not None and batch.navigation_noise:
-        given["noise"] = noise(batch.episode_steps + 1)
+        given = given | {"noise": noise(batch.episode_steps + 1)}
     obs, _ = batch.reset(options=given)
     ends = fly_until_ended(batch, policy, obs, restart=True)
     return ends | {"final_t": ends["final_time_s"], "final_error": ends["error"]}
@@ -184,19 +217,28 @@ def dispersed_metrics(flights: dict, rocket: Rocket) -> dict:
     errors = flights["error_norm"]
     metrics = {"dispersed_error_median": np.median(errors), "dispersed_error_max": errors.max()}
     metrics |= {f"dispersed_error_p{p}": np.percentile(errors, p) for p in (95, 99)}
-    misses = element_misses(flights, rocket)
-    closed = (flights["a_km"] > 0) & ~flights["crashed"]
-    for key, miss in misses.items():
+    closed = reached_orbit(flights)
+    for key, miss in element_misses(flights, rocket).items():
         name, unit = key.rsplit("_", 1)
         if closed.any():
             metrics[f"dispersed_{name}_error_mean_{unit}"] = miss[closed].mean()
             metrics[f"dispersed_{name}_error_std_{unit}"] = miss[closed].std()
-    inside = closed & np.all([np.abs(miss) <= BOX[key] for key, miss in misses.items()], axis=0)
-    metrics |= box_rate(int(inside.sum()), len(errors))
+    metrics |= box_rate(int(inside_box(flights, rocket).sum()), len(errors))
     mass = flights["final_mass_kg"]
     metrics |= {"dispersed_mass_mean_kg": mass.mean(), "dispersed_mass_p01_kg": np.percentile(mass, 1)}
     counts = {"dispersed_dry": int(flights["dry"].sum()), "dispersed_crashed": int(flights["crashed"].sum())}
     return {key: float(value) for key, value in metrics.items() if np.isfinite(value)} | counts
+
+
+def reached_orbit(flights: dict) -> np.ndarray:
+    """Whether flights (n,) ended on a closed orbit and not on the ground."""
+    return (flights["a_km"] > 0) & ~flights["crashed"]
+
+
+def inside_box(flights: dict, rocket: Rocket) -> np.ndarray:
+    """Whether flights (n,) ended inside the launcher's accuracy."""
+    misses = element_misses(flights, rocket)
+    return reached_orbit(flights) & np.all([np.abs(miss) <= BOX[key] for key, miss in misses.items()], axis=0)
 
 
 def savable_failures(arrays: dict, best_mass: np.ndarray, dry_mass: np.ndarray) -> np.ndarray:
@@ -234,12 +276,17 @@ def failure_metrics(arrays: dict, best_mass: np.ndarray, mass_reached: np.ndarra
 def element_misses(flights: dict, rocket: Rocket) -> dict:
     """The differences (n,) of flights from the target, in the order of `BOX`, in km and degrees.
 
-    An angle that the target does not have is left out.
+    Flights with targets of their own have a `target` (n, 5). An angle that the rocket's own target does not have is
+    left out.
     """
-    target = target_summary(rocket)
     flown = {key: flights[key] for key in ("i_deg", "raan_deg", "argp_deg")}
-    if rocket.i in EQUATORIAL:
-        flown["argp_deg"] = perigee_longitude(flown["raan_deg"], flown["argp_deg"], rocket.i)
+    if "target" in flights:
+        a, e, *angles = flights["target"].T
+        target = dict(zip(flown, angles)) | apsides(a / 1e3, e, rocket)
+    else:
+        target = target_summary(rocket)
+        if rocket.i in EQUATORIAL:
+            flown["argp_deg"] = perigee_longitude(flown["raan_deg"], flown["argp_deg"], rocket.i)
     flown |= apsides(flights["a_km"], flights["e"], rocket)
     return {key: wrapped(key, flown[key] - target[key]) for key in BOX if key in target}
 

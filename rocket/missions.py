@@ -15,6 +15,7 @@ import numpy as np
 
 from common.errors import BadInput, is_finite, refuse_unless
 from common.registration import register
+from rocket.targets import Targets
 from rocket.vehicle import ROCKET, Rocket
 
 
@@ -28,6 +29,7 @@ class Mission:
     floor_km: float = 110.0  # altitude below which a flight is penalised, from `floor_from` on
     floor_from: float = 300.0  # s
     guided_until: float | None = None  # s until which R_guidance has a reference pitch (None: the first burn's end)
+    targets: Targets | None = None  # every flight draws its target orbit from these (None: all fly to the rocket's)
     mass_unit: float | None = None  # kg, what `propellant_price` is the price of (None: 6 % of the dry mass)
 
     def __post_init__(self):
@@ -38,6 +40,10 @@ class Mission:
             value = getattr(self, name)
             possible = value is None or (is_finite(value) and value > 0)
             refuse_unless(possible, f"a mission's {name}", value, "must be positive and finite, or None")
+        possible = self.targets is None or isinstance(self.targets, Targets)
+        refuse_unless(possible, "a mission's targets", repr(self.targets), "must be envs.Targets(...), or None")
+        allowed = "must be None without cut-off: flights that all end at one time cannot reach orbits of any energy"
+        refuse_unless(self.targets is None or self.cutoff, "a mission's targets", self.targets, allowed)
 
     @property
     def ceiling(self) -> float:
@@ -48,6 +54,17 @@ class Mission:
 # The paper penalises an overshoot beyond 250 km. The boosters burn until 150.4 s. At the fixed time speed has to be
 # wasted, and too flat a climb wastes it as well: with a floor of 110 km two of three seeds flew along the floor.
 PAPER_MISSION = Mission(ROCKET, ceiling_km=250.0, floor_km=130.0, guided_until=ROCKET.burns[1].end, mass_unit=100.0)
+# Ours. The orbits are a launcher's usual ones from its site, from low ones to transfers to geostationary altitude.
+ANY_ORBIT = Mission(
+    ROCKET,
+    cutoff=True,
+    targets=Targets(
+        perigee_km=(180.0, 250.0),
+        apogee_km=(400.0, 36_000.0),
+        i_deg=(28.6, 40.0),
+        argp_deg=(-6.0, 6.0),
+    ),
+)
 ROCKETS: dict[str, Mission] = {}  # by environment id; `envs.py` and the files of `vehicles/` fill it
 
 

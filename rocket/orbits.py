@@ -72,34 +72,44 @@ def target_orbit(elements: OrbitalElements = ROCKET.target, mu: float = ROCKET.m
     return np.sqrt(mu * a * (1 - e * e))[..., None] * normal, e[..., None] * np.stack(perigee, axis=-1)
 
 
-def target_axes(rocket: Rocket = ROCKET) -> np.ndarray:
-    """The target orbit's axes (3, 3), unit vectors in ECI: to the perigee, along the semi-latus rectum, plane normal.
+def target_axes(rocket: Rocket = ROCKET, target: OrbitalElements | None = None) -> np.ndarray:
+    """The target orbit's axes (..., 3, 3), unit vectors in ECI: to the perigee, along the semi-latus rectum, normal.
 
-    A circle has no perigee. Its axes are those of an ellipse with the same angles.
+    `target` has the elements (...,) each of flights with targets of their own; without it, it is the rocket's. A circle
+    has no perigee. Its axes are those of an ellipse with the same angles.
     """
-    h, e = target_orbit(rocket.target._replace(e=rocket.e or 0.5), rocket.mu)
-    normal = h / np.linalg.norm(h)
-    perigee = e / np.linalg.norm(e)
-    return np.array([perigee, np.cross(normal, perigee), normal])
+    target = target or rocket.target
+    h, e = target_orbit(target._replace(e=np.where(np.equal(target.e, 0), 0.5, target.e)), rocket.mu)
+    normal = h / np.linalg.norm(h, axis=-1, keepdims=True)
+    perigee = e / np.linalg.norm(e, axis=-1, keepdims=True)
+    return np.stack([perigee, np.cross(normal, perigee), normal], axis=-2)
 
 
-def terminal_error(state, rocket: Rocket = ROCKET) -> np.ndarray:
+def terminal_error(state, rocket: Rocket = ROCKET, target: OrbitalElements | None = None) -> np.ndarray:
     """(h - h_T) / |h_T| and e - e_T in ECI, (..., 6), of states (..., 6 or more: r in m, v in m/s).
 
-    This is our measure. It is smooth and has no singularity. It is zero if and only if all five elements are the
-    target's.
+    `target` is as in `target_axes`. This is our measure. It is smooth and has no singularity. It is zero if and only if
+    all five elements are the target's.
     """
     h, e = orbit_vectors(np.moveaxis(np.asarray(state, dtype=np.float64), -1, 0), rocket.mu)
-    h_target, e_target = target_orbit(rocket.target, rocket.mu)
-    of_momentum = (np.stack(h, axis=-1) - h_target) / np.linalg.norm(h_target)
+    h_target, e_target = target_orbit(target or rocket.target, rocket.mu)
+    size = np.linalg.norm(h_target, axis=-1, keepdims=True)
+    of_momentum = (np.stack(h, axis=-1) - h_target) / size
     of_eccentricity = np.stack(e, axis=-1) - e_target
     return np.concatenate([of_momentum, of_eccentricity], axis=-1)
+
+
+def components(axes, x):
+    """The components (3, N) of vectors x (3, N) along axes (3, 3), or along each one's own axes (3, 3, N)."""
+    if axes.ndim == 2:
+        return axes @ x
+    return (axes * x).sum(axis=1)
 
 
 def local_frame(y, normal):
     """Unit vectors up, along-track (normal x up), cross-track (up x along) at states y (7, N): (3, N) each.
 
-    `normal` (3,) is the unit normal of the target's plane, in ECI.
+    `normal` (3,) is the unit normal of the target's plane, in ECI. It is (3, N) if each state has its own target.
 
     The products are written out, because a matrix product would round a row differently in a larger batch.
     """
@@ -108,5 +118,5 @@ def local_frame(y, normal):
     nx, ny, nz = normal
     along = np.array([ny * rz - nz * ry, nz * rx - nx * rz, nx * ry - ny * rx])
     length = np.sqrt((along * along).sum(axis=0))
-    cross = normal[:, None] - (nx * rx + ny * ry + nz * rz) * up
+    cross = normal.reshape(3, -1) - (nx * rx + ny * ry + nz * rz) * up
     return up, along / length, cross / length

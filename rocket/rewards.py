@@ -91,7 +91,8 @@ def mass_rewards(ends, rocket: Rocket, scale, group_size, also_far=False):
     R_terminal is nearly linear in the errors, so its residuals are small, and little is paid. With `also_far` the
     spread is R_terminal's own, so as much is paid there as near the target.
     """
-    cut_off = np.abs(1e3 * ends["a_km"] / rocket.a - 1) < 1e-6  # other energies would add a fifth direction
+    a = ends["target"][:, 0] if "target" in ends else rocket.a
+    cut_off = np.abs(1e3 * ends["a_km"] / a - 1) < 1e-6  # other energies would add a fifth direction
     near = cut_off & (ends["error_norm"] < 0.05)
     paid = np.zeros(len(ends["error"]))
     judged = np.column_stack([ends["final_mass_kg"], terminal_reward(ends["error_norm"], scale)])

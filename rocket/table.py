@@ -28,7 +28,7 @@ def table(metrics: dict, mission: Mission) -> str:
     success = ["yes" if hit else "no" for hit in (optimum_succeeds, metrics["success"])]
     rows.append(("success", "-", *success, "crashed" if metrics["crashed"] else "-"))
     title = f"{metrics['env_id']}: difference from the target, or where there is none from the optimum"
-    below = [*remarks(metrics, mission), *dispersed_lines(metrics), *failure_lines(metrics)]
+    below = [*remarks(metrics, mission), *target_lines(metrics), *dispersed_lines(metrics), *failure_lines(metrics)]
     return "\n".join([title, *lines_of(rows), *below])
 
 
@@ -80,6 +80,19 @@ def table_rows(mission: Mission) -> list[tuple[str, str, int]]:
         (f"lowest altitude after {mission.floor_from:.0f} s (km)", lowest_key(mission), 3),
         (f"||error|| (success: below {SUCCESS})", "error_norm", 6),
     ]
+
+
+def target_lines(metrics: dict) -> list[str]:
+    """The lines below the rocket's table about flights to other targets. There are none where all fly to one orbit."""
+    if "target_starts" not in metrics:
+        return []
+    errors = ", ".join(f"{name} {metrics[f'target_error_{name}']:.6f}" for name in ("median", "p95", "max"))
+    lines = [f"  {metrics['target_starts']} flights, each to its own target: ||error|| {errors}"]
+    lines.append(f"    inside the box {metrics['target_box_rate']:.2%}; {metrics['target_crashed']} crashed")
+    if "target_mass_ratio_mean" in metrics:
+        ratios = ", ".join(f"{name} {metrics[f'target_mass_ratio_{name}']:.4%}" for name in ("mean", "min"))
+        lines.append(f"    mass of the optimum's for the first {metrics['target_reference_starts']} targets: {ratios}")
+    return lines
 
 
 def dispersed_lines(metrics: dict) -> list[str]:

@@ -10,6 +10,7 @@ import numpy as np
 from common.command_line import integer, number
 from common.errors import refuse_unless
 from common.flying import decision_us
+from rocket.any_orbit import evaluate_targets
 from rocket.comparison import compare
 from rocket.environment import flown_mission, fly_rocket
 from rocket.failure import FAILURE_TIMES, LARGEST_FAILURE, NEEDS_CUTOFF
@@ -23,12 +24,14 @@ from rocket.metrics import (
     failure_metrics,
     healthy,
     lowest_key,
+    own_flight,
     perigee_longitude,
     rocket_metrics,
     savable_failures,
 )
 from rocket.missions import ROCKETS, Mission
 from rocket.navigation import ALLOWED, NOMINAL_FLIGHT, flight_noise, is_noise, noise_metrics
+from rocket.neighbours import compare_targets
 from rocket.optimum import kept_reference, reached_optimum
 from rocket.report import report_failures, report_rocket
 from rocket.rescue import Failing, known_optima
@@ -96,6 +99,10 @@ class RocketTask:
         metrics |= rocket_metrics(flight, reference, self.flown_with(**env_options).mission)
         arrays = {key: flight[key] for key in ("t", "u", "y", "reward")}
         arrays |= {f"{key}_reference": reference[key] for key in ("t", "u", "y")}
+        if self.mission.targets is not None:
+            found, ends = evaluate_targets(self.env_id, self.mission, policy, eval_seed, n, **env_options)
+            own = {f"{key}_own": arrays.pop(key) for key in ("t", "u")}
+            metrics, arrays = metrics | found, arrays | own | ends
         if dispersion or failure:
             failing = Failing(dispersion, failure, failure_time)
             of_healthy, ends = evaluate_dispersed(self.env_id, policy, eval_seed, n, **failing._asdict(), **env_options)
@@ -150,15 +157,20 @@ class RocketTask:
             return {}
         return {"mass_ratio_reached": metrics["final_mass_kg"] / mass, "reference_mass_reached_kg": mass}
 
+    @property
+    def flies_many(self) -> bool:
+        """Whether an evaluation flies many flights also without draws."""
+        return self.mission.targets is not None
+
     # --- the size of an evaluation, and what a run may not do
 
     def default_flights(self, is_brief: bool, **env_options) -> int:
-        if has_draws(**env_options):
+        if has_draws(**env_options) or self.flies_many:
             return INTERIM_STARTS if is_brief else DISPERSED_STARTS
         return 50 if is_brief else 1000  # only noted, because there is one start
 
     def interim_flights(self, n: int, **env_options) -> int:
-        return min(n, INTERIM_STARTS) if has_draws(**env_options) else n
+        return min(n, INTERIM_STARTS) if has_draws(**env_options) or self.flies_many else n
 
     def remark_on_seed(self, eval_seed: int) -> str | None:
         return None  # draws of an evaluation come from another stream
@@ -170,6 +182,8 @@ class RocketTask:
             return "navigation_noise", ALLOWED
         if failure and not self.mission.cutoff:
             return "failure", NEEDS_CUTOFF
+        if failure and self.flies_many:
+            return "failure", "must be 0 where flights have targets of their own"
         if has_draws(failure=failure, **env_options) and trains and not observe_phase:
             why = "not in a training with --dispersion or --failure: the nominal flight is looked up by the phase"
             return "no_observe_phase", why
@@ -190,6 +204,12 @@ class RocketTask:
             "final_mass_kg": ("final mass (kg)", ".2f"),
             "mass_ratio": ("mass / optimum's", ".4f"),
             "mass_ratio_reached": ("mass / optimum's for the orbit reached", ".4f"),
+            "target_error_median": ("targets: ||error||, median", ".6f"),
+            "target_error_p95": ("targets: ||error||, p95", ".6f"),
+            "target_error_max": ("targets: ||error||, worst", ".6f"),
+            "target_box_rate": ("targets: in the box", ".2%"),
+            "target_mass_ratio_mean": ("targets: mass / optimum's, mean", ".5f"),
+            "target_mass_ratio_min": ("targets: mass / optimum's, worst", ".5f"),
             "dispersed_error_median": ("dispersed: ||error||, median", ".6f"),
             "dispersed_error_p95": ("dispersed: ||error||, p95", ".6f"),
             "dispersed_perigee_error_mean_km": ("dispersed: perigee off, mean (km)", ".2f"),
@@ -205,7 +225,9 @@ class RocketTask:
     def progress_keys(self, dispersion: float = 0.0, failure: float = 0.0, **env_options) -> list[str]:
         dispersed = ["dispersed_error_median", "dispersed_error_p95", "dispersed_box_rate"]
         failed = ["failure_error_median", "failure_error_p95", "failure_saved_rate"]
-        return ["error_norm", "mass_ratio", *(dispersed if dispersion else []), *(failed if failure else [])]
+        targets = ["target_error_median", "target_error_p95", "target_box_rate"]
+        targets = targets if self.mission.targets is not None else []
+        return ["error_norm", "mass_ratio", *targets, *(dispersed if dispersion else []), *(failed if failure else [])]
 
     def headline(self, metrics: dict) -> str:
         """A figure's title: error and mass."""
@@ -218,9 +240,10 @@ class RocketTask:
 
     def figures(self, arrays: dict, metrics: dict, curves: list[dict]) -> dict:
         from drawing.training import Miss, training_figure
-        from rocket.figures import ascent_figure, dispersed_figure, orbit_figure
+        from rocket.figures import ascent_figure, dispersed_figure, orbit_figure, targets_figure
 
         title = self.headline(metrics)
+        arrays = own_flight(arrays)
         figures = {}
         if curves:
             label = "$\\Vert$error$\\Vert$ of the mean action"
@@ -233,11 +256,14 @@ class RocketTask:
             inside = f"{metrics['dispersed_box_rate']:.1%} of {metrics['dispersed_starts']} flights inside the box"
             title = f"{self.env_id} at dispersion {metrics['dispersion']:g}: {inside}"
             figures["dispersed.png"] = dispersed_figure(self.mission.rocket, flights_shown(arrays), title)
+        if "target_starts" in metrics:
+            figures["targets.png"] = targets_figure(self.mission.rocket, arrays, f"{self.env_id}: any orbit")
         return figures
 
     def animation(self, arrays: dict, metrics: dict):
         from rocket.animation import ascent_animation
 
+        arrays = own_flight(arrays)
         if "saved" not in arrays:
             return ascent_animation(self.mission.rocket, arrays, self.headline(metrics))
         vehicle = Failing.of(metrics).vehicles(self.mission.rocket, arrays["draw"][arrays["saved"]][None])
@@ -251,6 +277,8 @@ class RocketTask:
         names = {f"{key}{side}" for key in ("t", "u", "y") for side in ("", "_reference")} | {"reward"}
         if {"dispersion", "failure"} & metrics.keys():
             names |= {"draw", "final_y", "final_error"}
+        if "target_starts" in metrics:
+            names |= {"t_own", "u_own", "target", "final_y", "final_error", "best_mass"}
         return names | ({"failure"} if "failure" in metrics else set())
 
     def kept_arrays(self, arrays: dict) -> dict:
@@ -284,6 +312,10 @@ class RocketTask:
         return report_failures(self.env_id, failing, args.starts, args.seed)
 
     def fly_opponents(self, folder, **options) -> None:
+        if self.flies_many:
+            names = ("n", "solved", "eval_seed", "also")
+            compare_targets(self.env_id, folder, **{name: options[name] for name in names})
+            return
         compare(self.env_id, folder, **options)
 
 

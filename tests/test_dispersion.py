@@ -371,7 +371,7 @@ def test_bad_draws_are_refused(draw, message):
 
 
 def test_bad_options_are_refused():
-    with pytest.raises(BadInput, match="'draw'.*a rocket has none without dispersion, failure or"):
+    with pytest.raises(BadInput, match="'draw'.*a rocket has none without targets, dispersion, failure or"):
         gym.make_vec(CUTOFF).reset(options={"draw": np.zeros((1, 16))})
     with pytest.raises(BadInput, match="the only one is 'draw'"):
         make(CUTOFF).reset(options={"x0": 1})

@@ -147,7 +147,11 @@ def test_the_double_integrators_script_loads_no_other_familys_environment():
     ours = {name for name in script if name in ROOMS}
     assert not {name for name in ours if name.endswith(("optimum", "export", "task", "figures", "environment"))}
     assert not script & {"baselines", "evaluate", "rocket.kalman", "matplotlib"}
-    assert {name for name in task if name.startswith("rocket.")} == {"rocket.missions", "rocket.vehicle"}
+    assert {name for name in task if name.startswith("rocket.")} == {
+        "rocket.missions",
+        "rocket.targets",
+        "rocket.vehicle",
+    }
     assert {name for name in task if name.startswith("landing.")} == {"landing.lander"}
 
 

@@ -295,7 +295,7 @@ def test_a_bad_file_of_vehicles_is_left_out_with_a_line(tmp_path):
     (tmp_path / "vehicles" / "zz_copy.py").write_text(good.replace("payload=20e3", "payload=19e3"))
     code = "import envs, gymnasium; print(*envs.ROCKETS); print(gymnasium.make('TwoStageLEO-v0').reset()[0][6])"
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=60)
-    assert done.stdout.split() == [FIXED, CUTOFF, LEO, "564500.0"]
+    assert done.stdout.split() == [FIXED, CUTOFF, "RocketAscentAnyOrbit-v0", LEO, "564500.0"]
     first, second, third, fourth, copy = done.stderr.splitlines()
     assert first == "vehicles/a_bad_one.py is left out: a rocket's payload is -20000.0; it must not be negative"
     assert second.startswith("vehicles/b_foreign.py is left out: env_id is 'VanDerPol-v0'")
