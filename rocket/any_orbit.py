@@ -22,7 +22,7 @@ from rocket.metrics import fly_batches, inside_box, targets_of
 from rocket.missions import Mission
 from rocket.navigation import flight_noise
 from rocket.optimum import RESULTS, kept_reference
-from rocket.orbits import target_orbit
+from rocket.orbits import target_axes, target_orbit
 from rocket.targets import elements_of
 from rocket.vehicle import Rocket
 
@@ -32,6 +32,7 @@ from rocket.vehicle import Rocket
 
 STORED = RESULTS / "target_optima"
 REFERENCES = 300  # targets of an evaluation that have their optimum
+OF_FEW = 30  # of those of a small evaluation, which a training makes on its way
 FLIGHTS_PER_PROCESS = 50  # a process takes two seconds to start, a solve half of one
 
 
@@ -44,8 +45,10 @@ def solve_target(job) -> dict | None:
     """The optimum of one target, as `optimise_remaining` returns it, or None. job is (rocket, target (5,), guesses)."""
     rocket, target, guesses = job
     vehicle = nominal_vehicle(rocket)
-    orbit = target_orbit(elements_of(target), rocket.mu)
+    elements = elements_of(target)
+    orbit = target_orbit(elements, rocket.mu)
     ascent = guidance.vehicle_ascent(vehicle, 0.0, rocket.x0[:6], vehicle.burn_out[0], orbit)
+    ascent = ascent._replace(axes=target_axes(rocket, elements)[:2])
     for guess in guesses:
         try:
             return guidance.optimise_remaining(rocket, ascent, guess, guidance.drawn_intervals(rocket, guess["t"][-1]))
@@ -78,6 +81,11 @@ def flown_to(env_id: str, targets: np.ndarray, optima: list) -> list[dict]:
         for target, optimum in zip(targets, optima)
         if optimum
     ]
+
+
+def references(n: int) -> int:
+    """How many of an evaluation's n targets have their optimum."""
+    return min(n, REFERENCES if n > REFERENCES else OF_FEW)
 
 
 def about(env_id: str, mission: Mission, eval_seed: int) -> str:
@@ -142,7 +150,7 @@ def evaluate_targets(env_id: str, mission: Mission, policy, eval_seed: int, n: i
     metrics = {"target_error_median": np.median(errors), "target_error_p95": np.percentile(errors, 95)}
     metrics |= {"target_error_max": errors.max(), "target_box_rate": inside_box(ends, mission.rocket).mean()}
     best = np.full(n, np.nan)
-    solved = min(n, REFERENCES)
+    solved = references(n)
     best[:solved] = target_masses(env_id, mission, eval_seed, solved)
     known = np.isfinite(best)
     if known.any():

@@ -40,7 +40,7 @@ from rocket.optimum import (
     orbit_defect,
     state_scale,
 )
-from rocket.orbits import orbit_vectors, specific_energy, target_orbit, terminal_error
+from rocket.orbits import orbit_vectors, specific_energy, target_axes, target_orbit, terminal_error
 from rocket.vehicle import Rocket
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -229,6 +229,7 @@ class RemainingAscent(NamedTuple):
     h: np.ndarray  # (3,) m^2/s, angular momentum of the orbit to be reached
     e: np.ndarray  # (3,) eccentricity vector of this orbit
     air: tuple[float, float, float] = CALM
+    axes: np.ndarray | None = None  # (2, 3) in the orbit's plane; without it those of the rocket's own target
 
 
 @cache
@@ -256,9 +257,10 @@ def remaining_solver(rocket: Rocket, fixed: int, last: int):
     rows = ca.vertcat(mass - flow * dt * ca.DM(range(last)).T, thrust * one, flow * one, dt * one)
     parameters = ca.vertcat(ca.horzcat(engine, rows), ca.repmat(air, 1, n))
     defects, ends = collocation(rocket, in_wind=True).map(n)(ca.horzcat(start, x[:, :-1]), z, u, parameters)
-    orbit = orbit_defect(rocket, scale * x[:, -1], h, e)
+    axes = ca.MX.sym("axes", 2, 3)
+    orbit = orbit_defect(rocket, scale * x[:, -1], h, e, axes)
     constraints = ca.veccat(defects, x - ends, ca.sum1(u**2) - 1, orbit, ca.sqrt(ca.sum1(x[:3, :] ** 2)))
-    program = {"x": ca.veccat(x, z, u, duration), "p": ca.veccat(start, engine, burn, air, h, e)}
+    program = {"x": ca.veccat(x, z, u, duration), "p": ca.veccat(start, engine, burn, air, h, e, axes)}
     program |= {"f": duration / (scale[0] / scale[3]), "g": constraints}
     options = {"expand": True, "print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.tol": 1e-9}
     options |= {"ipopt.max_iter": MAX_ITERATIONS}
@@ -283,7 +285,8 @@ def remaining_parameters(rocket: Rocket, remaining: RemainingAscent, intervals) 
     start = remaining.state / state_scale(rocket)
     start[3] += 1e-16  # as in ascent_program
     burn = remaining.mass[-1], remaining.thrust[-1], remaining.flow[-1]
-    return np.concatenate([start, engine.T.ravel(), burn, remaining.air, remaining.h, remaining.e])
+    axes = target_axes(rocket)[:2] if remaining.axes is None else remaining.axes
+    return np.concatenate([start, engine.T.ravel(), burn, remaining.air, remaining.h, remaining.e, axes.T.ravel()])
 
 
 @interruptible()

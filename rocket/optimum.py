@@ -178,15 +178,15 @@ def burning(rocket: Rocket, t):
     return thrust[arc], flow[arc], start[arc], mass[arc]
 
 
-def orbit_defect(rocket: Rocket, x, h_target, e_target):
+def orbit_defect(rocket: Rocket, x, h_target, e_target, axes):
     """Five independent numbers that are 0 if a state x (r, v; a CasADi symbol) is on the orbit of these vectors.
 
-    e is normal to h. So when h is the target's, only two components of e are left, in the plane of the rocket's target.
+    e is normal to h. So when h is the target's, only two components of e are left, along axes (2, 3) in its plane.
     """
     import casadi as ca
 
     h, e = (ca.vertcat(*vector) for vector in orbit_vectors(ca.vertsplit(x), rocket.mu))
-    return ca.vertcat((h - h_target) / ca.norm_2(h_target), ca.DM(target_axes(rocket)[:2]) @ (e - e_target))
+    return ca.vertcat((h - h_target) / ca.norm_2(h_target), axes @ (e - e_target))
 
 
 def ascent_program(case: AscentCase, mesh: AscentMesh):
@@ -214,7 +214,7 @@ def ascent_program(case: AscentCase, mesh: AscentMesh):
     interval = collocation(rocket) if mesh.points else zero_order_hold_step(rocket)
     defects, ends = interval.map(n)(ca.horzcat(x0, x[:, :-1]), z, u[:, mesh.column.tolist()], engine)
     target = (ca.DM(vector) for vector in target_orbit(rocket.target, rocket.mu))
-    orbit = orbit_defect(rocket, ca.DM(scale) * x[:, -1], *target)
+    orbit = orbit_defect(rocket, ca.DM(scale) * x[:, -1], *target, ca.DM(target_axes(rocket)[:2]))
     constraints = ca.veccat(defects, x - ends, ca.sum1(u**2) - 1, orbit, ca.sqrt(ca.sum1(x[:3, :] ** 2)))
     cost = end / (scale[0] / scale[3]) if case.free else ca.sumsqr(u[:, 1:] - u[:, :-1])
     return {"x": ca.veccat(x, z, u, end), "f": cost, "g": constraints}

@@ -10,7 +10,7 @@ import numpy as np
 from common.command_line import integer, number
 from common.errors import refuse_unless
 from common.flying import decision_us
-from rocket.any_orbit import evaluate_targets
+from rocket.any_orbit import evaluate_targets, references, target_masses
 from rocket.comparison import compare
 from rocket.environment import flown_mission, fly_rocket
 from rocket.failure import FAILURE_TIMES, LARGEST_FAILURE, NEEDS_CUTOFF
@@ -66,11 +66,13 @@ class RocketTask:
         return {"draw": draws(self.flown_with(**env_options).mission.rocket, dispersion, eval_seed, n, failure)}
 
     def optimum(self, eval_seed: int, n: int, **env_options) -> dict:
-        """The optimum of the nominal flight, also with draws. With failures it also solves and keeps `known_optima`."""
+        """The optimum of the nominal flight, also with draws. It also solves and keeps the optima that evaluations need."""
         task = self.flown_with(**env_options)
         failing = Failing.of(env_options)
         if failing.failure:
             known_optima(self.env_id, task.mission, failing, eval_seed, n)
+        if self.flies_many:
+            target_masses(self.env_id, task.mission, eval_seed, references(n))
         return kept_reference(self.env_id, task.mission)
 
     def evaluate(
@@ -86,21 +88,23 @@ class RocketTask:
     ):
         """Fly the nominal rocket once beside the optimum. With `dispersion` or `failure` also fly n that differ.
 
-        Without them seed and n are only noted. With the options `rocket` or `table_isp` the target and the optimum are
+        Where flights have targets of their own, the nominal rocket also flies to n targets. In all other cases without
+        draws seed and n are only noted. With the options `rocket` or `table_isp` the target and the optimum are
         those of that rocket. Metrics that are not finite (the apogee of a hyperbola) or have no meaning are left out.
         Returns the metrics of eval.json and the arrays of eval.npz.
         """
         if reference is None:
             reference = self.optimum(eval_seed, n, **env_options)
+        task = self.flown_with(**env_options)
         noise = partial(flight_noise, eval_seed, [NOMINAL_FLIGHT])
         flight = fly_rocket(self.env_id, policy, noise=noise, **env_options)
         metrics = {"env_id": self.env_id, "eval_seed": eval_seed, "eval_starts": 1}
         metrics |= noise_metrics(env_options.get("navigation_noise"))
-        metrics |= rocket_metrics(flight, reference, self.flown_with(**env_options).mission)
+        metrics |= rocket_metrics(flight, reference, task.mission)
         arrays = {key: flight[key] for key in ("t", "u", "y", "reward")}
         arrays |= {f"{key}_reference": reference[key] for key in ("t", "u", "y")}
-        if self.mission.targets is not None:
-            found, ends = evaluate_targets(self.env_id, self.mission, policy, eval_seed, n, **env_options)
+        if self.flies_many:
+            found, ends = evaluate_targets(self.env_id, task.mission, policy, eval_seed, n, **env_options)
             own = {f"{key}_own": arrays.pop(key) for key in ("t", "u")}
             metrics, arrays = metrics | found, arrays | own | ends
         if dispersion or failure:
@@ -108,7 +112,6 @@ class RocketTask:
             of_healthy, ends = evaluate_dispersed(self.env_id, policy, eval_seed, n, **failing._asdict(), **env_options)
             metrics, arrays = metrics | of_healthy, arrays | ends
             if failure:
-                task = self.flown_with(**env_options)
                 known = known_optima(self.env_id, task.mission, failing, eval_seed, n)
                 rocket = task.mission.rocket
                 dry_mass = failing.vehicles(rocket, ends["draw"]).dry_mass
