@@ -66,7 +66,7 @@ class RocketTask:
         return {"draw": draws(self.flown_with(**env_options).mission.rocket, dispersion, eval_seed, n, failure)}
 
     def optimum(self, eval_seed: int, n: int, **env_options) -> dict:
-        """The optimum of the nominal flight, also with draws. It also solves and keeps the optima that evaluations need."""
+        """The optimum of the nominal flight, also with draws. It also finds the optima that evaluations need."""
         task = self.flown_with(**env_options)
         failing = Failing.of(env_options)
         if failing.failure:
