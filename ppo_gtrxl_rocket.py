@@ -182,10 +182,13 @@ FAILING = {  # replaces values of DISPERSED; training begins with a policy of he
     "direct_differences": True,  # a failure makes them large, and the blocks go on wrongly beyond what they have seen
     "mass_weight": "0.1:0 0.2:1 0.5:1 0.85:0",  # so that failed flights burn less
 }
-ANY_ORBIT = {  # replaces values of CUTOFF
+ANY_ORBIT = {  # replaces values of CUTOFF where every flight has its own target: six targets an update
     "total_updates": 400,
     "num_envs": 96,
     "flights_per_start": 16,
+    "num_minibatches": 16,
+    "log_std": "0:-1 0.4:-3.5 0.9:-6 1:-7.5",  # many orbits need longer at every size of noise
+    "mass_weight": "0.1:0 0.2:2 0.7:2 0.95:0",
 }
 RECIPES = {env_id: CUTOFF if mission.cutoff else FIXED for env_id, mission in ROCKETS.items()}
 RECIPES |= {env_id: {**CUTOFF, **ANY_ORBIT} for env_id, mission in ROCKETS.items() if mission.targets}

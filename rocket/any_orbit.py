@@ -110,7 +110,7 @@ def target_masses(env_id: str, mission: Mission, eval_seed: int, n: int) -> np.n
 
 
 def masses(optima: list) -> np.ndarray:
-    """The kg (n,) that optima leave, NaN where there is none."""
+    """The kg (n,) that optima leave, NaN where none was found."""
     return np.array([optimum["final_mass"] if optimum else np.nan for optimum in optima])
 
 

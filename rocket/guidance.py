@@ -263,7 +263,7 @@ def remaining_solver(rocket: Rocket, fixed: int, last: int):
     program = {"x": ca.veccat(x, z, u, duration), "p": ca.veccat(start, engine, burn, air, h, e, axes)}
     program |= {"f": duration / (scale[0] / scale[3]), "g": constraints}
     options = {"expand": True, "print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.tol": 1e-9}
-    options |= {"ipopt.max_iter": MAX_ITERATIONS}
+    options |= {"ipopt.max_iter": MAX_ITERATIONS, "show_eval_warnings": False}
     return ca.nlpsol("remaining", "ipopt", program, options)
 
 

@@ -1,6 +1,7 @@
 """`python baselines.py rocket`, or the same with a rocket's id: solve, print rows, checks and the open-loop opponent.
 
-With --failure it solves and prints what flights with failures can still reach.
+With --failure it solves and prints what flights with failures can still reach. Where flights have targets of their own
+it solves those of a seed.
 """
 
 from __future__ import annotations
@@ -9,7 +10,10 @@ import time
 
 import numpy as np
 
+from rocket.any_orbit import about as about_targets
+from rocket.any_orbit import masses, refuse_unreachable, solve_targets
 from rocket.failure import group_names
+from rocket.metrics import targets_of
 from rocket.missions import ROCKETS
 from rocket.optimum import (
     ASCENTS,
@@ -92,6 +96,29 @@ def open_loop_numbers(flights: dict) -> dict:
             numbers[name] = {part: float(opponent[part]) for part in ("error_norm", "final_mass_kg", "final_time_s")}
             print(f"{name:<40}" + "  ".join(f"{part} {value:.7g}" for part, value in numbers[name].items()))
     return numbers
+
+
+def report_targets(env_id: str, starts: int, seed: int) -> tuple[dict, dict]:
+    """Solve the optima of the first targets of a seed, and print what they leave.
+
+    Returns the numbers, and the arrays `about`, `target` (n, 5) and `mass` (n,) in kg, NaN without an optimum.
+    Evaluations read them from a file in results/. Raises NoOptimum if a corner of the ranges is out of reach.
+    """
+    mission = ROCKETS[env_id]
+    refuse_unreachable(env_id, mission)
+    targets = targets_of(mission, seed, starts)
+    began = time.perf_counter()
+    mass = masses(solve_targets(env_id, mission, targets))
+    seconds = time.perf_counter() - began
+    solved = np.isfinite(mass)
+    numbers = {"starts": starts, "seed": seed, "solved": int(solved.sum()), "solve_seconds": seconds}
+    numbers |= {"mass_mean_kg": float(mass[solved].mean()), "mass_min_kg": float(mass[solved].min())}
+    numbers |= {"mass_max_kg": float(mass[solved].max())}
+    print(f"{env_id}: {starts} targets of seed {seed}, {numbers['solved']} solved in {seconds:.0f} s")
+    print(
+        "  mass left (kg): " + ", ".join(f"{name} {numbers[f'mass_{name}_kg']:.2f}" for name in ("mean", "min", "max"))
+    )
+    return numbers, {"about": np.array(about_targets(env_id, mission, seed)), "target": targets, "mass": mass}
 
 
 def report_failures(env_id: str, failing: Failing, starts: int, seed: int) -> tuple[dict, dict]:

@@ -10,7 +10,7 @@ import numpy as np
 from common.command_line import integer, number
 from common.errors import refuse_unless
 from common.flying import decision_us
-from rocket.any_orbit import evaluate_targets, references, target_masses
+from rocket.any_orbit import REFERENCES, evaluate_targets, references, target_masses
 from rocket.comparison import compare
 from rocket.environment import flown_mission, fly_rocket
 from rocket.failure import FAILURE_TIMES, LARGEST_FAILURE, NEEDS_CUTOFF
@@ -33,7 +33,7 @@ from rocket.missions import ROCKETS, Mission
 from rocket.navigation import ALLOWED, NOMINAL_FLIGHT, flight_noise, is_noise, noise_metrics
 from rocket.neighbours import compare_targets
 from rocket.optimum import kept_reference, reached_optimum
-from rocket.report import report_failures, report_rocket
+from rocket.report import report_failures, report_rocket, report_targets
 from rocket.rescue import Failing, known_optima
 from rocket.table import table
 
@@ -299,11 +299,21 @@ class RocketTask:
         parser.add_argument("--failure", type=number(0, LARGEST_FAILURE), default=0.0, metavar="K", help=about)
         parser.add_argument("--failure-time", choices=FAILURE_TIMES, default="random", help="default random")
         parser.add_argument("--dispersion", type=number(0, 10), default=0.0, metavar="D", help="of those flights")
-        starts, at_first = integer(1, 100_000), DISPERSED_STARTS
+        starts, at_first = integer(1, 100_000), self.flights_solved
         parser.add_argument("--starts", type=starts, default=at_first, metavar="N", help=f"of them: default {at_first}")
         parser.add_argument("--seed", type=integer(0, 2**31), default=0, metavar="S", help="of them: default 0")
 
+    @property
+    def flights_solved(self) -> int:
+        """How many flights `baselines.py` solves by default, where there are many."""
+        return REFERENCES if self.flies_many else DISPERSED_STARTS
+
     def baseline_command(self, args) -> tuple[dict, dict]:
+        if self.flies_many:
+            refuse_unless(
+                not args.failure, "--failure", args.failure, "must be 0 where flights have targets of their own"
+            )
+            return report_targets(self.env_id, args.starts, args.seed)
         if not args.failure:
             unless_failing = {"dispersion": 0.0, "failure_time": "random", "starts": DISPERSED_STARTS, "seed": 0}
             for name, default in unless_failing.items():
