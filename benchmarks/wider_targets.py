@@ -16,7 +16,7 @@ import numpy as np
 from benchmarks.policies import load
 from common.command_line import OneLineParser, integer
 from common.tables import lines_of
-from envs import ROCKETS
+from common.tasks import task_of
 from rocket.any_orbit import masses, solve_targets
 from rocket.metrics import fly_batches, inside_box, targets_of
 
@@ -35,7 +35,7 @@ WIDER = {  # {row: what replaces the range's numbers}
 
 def row(agent, env_id: str, options: dict, changes: dict, n: int) -> list[str]:
     """The cells of one range: optima found, then of those targets median, p95, worst and share in the box; mass."""
-    mission = ROCKETS[env_id]
+    mission = task_of(env_id).mission
     mission = replace(mission, targets=replace(mission.targets, **changes))
     targets = targets_of(mission, 0, n)
     best = masses(solve_targets(env_id, mission, targets))

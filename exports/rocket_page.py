@@ -175,10 +175,10 @@ def target_sliders(mission: Mission) -> list[dict]:
     rocket = mission.rocket
     own = apsides(rocket.a / 1e3, rocket.e, rocket)
     rows = [
-        ("perigee", "perigee", "km", mission.targets.perigee_km, own["perigee_km"], 1.0, False),
-        ("apogee", "apogee", "km", mission.targets.apogee_km, own["apogee_km"], 0.01, True),
-        ("i", "inclination", "°", mission.targets.i_deg, rocket.i, 0.1, False),
-        ("argp", "perigee off its natural place", "°", mission.targets.argp_deg, 0.0, 0.1, False),
+        ("perigee", "perigee", "km", mission.ranges.perigee_km, own["perigee_km"], 1.0, False),
+        ("apogee", "apogee", "km", mission.ranges.apogee_km, own["apogee_km"], 0.01, True),
+        ("i", "inclination", "°", mission.ranges.i_deg, rocket.i, 0.1, False),
+        ("argp", "perigee off its natural place", "°", mission.ranges.argp_deg, 0.0, 0.1, False),
     ]
     names = ("name", "label", "unit", "range", "value", "step", "logarithmic")
     return [dict(zip(names, row)) for row in rows]
@@ -189,7 +189,7 @@ def grid_optima(env_id: str, mission: Mission) -> list[dict]:
 
     The perigee and its place are in the middle of their ranges.
     """
-    ranges = mission.targets
+    ranges = mission.ranges
     shares = [[0.5, apogee, i, 0.5, 0.5] for apogee in np.linspace(0, 1, 4) for i in np.linspace(0, 1, 3)]
     targets = ranges.at(shares, mission.rocket)
     optima = solve_targets(env_id, mission, targets, processes=1)

@@ -65,7 +65,7 @@ def solve_targets(env_id: str, mission: Mission, targets: np.ndarray, processes:
     rocket = mission.rocket
     own = guidance.guess_of(kept_reference(env_id, mission))
     guesses = [own]
-    middle = solve_target((rocket, mission.targets.corners(rocket)[0], guesses))
+    middle = solve_target((rocket, mission.ranges.corners(rocket)[0], guesses))
     if middle:
         guesses.append(middle)
     if processes is None:
@@ -116,7 +116,7 @@ def masses(optima: list) -> np.ndarray:
 
 def refuse_unreachable(env_id: str, mission: Mission):
     """Raise NoOptimum if the optimum of a corner of the targets' ranges is not found."""
-    corners = mission.targets.corners(mission.rocket)
+    corners = mission.ranges.corners(mission.rocket)
     for target, optimum in zip(corners, solve_targets(env_id, mission, corners)):
         if optimum is None:
             raise NoOptimum(f"{env_id}: no optimum to {in_words(target, mission.rocket)}, which is in its targets")

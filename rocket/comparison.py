@@ -292,12 +292,14 @@ class Comparison:
 def recorded_flights(arrays: dict, rocket: Rocket, failing: Failing) -> dict:
     """The flights (n,) of eval.npz's arrays, in the form that `dispersed_metrics` reads."""
     y = arrays["final_y"]
-    return final_elements(y, rocket) | {
+    flights = final_elements(y, rocket) | {
         "final_mass_kg": y[:, 6],
         "error_norm": np.linalg.norm(arrays["final_error"], axis=1),
-        "dry": arrays["final_t"] >= failing.vehicles(rocket, arrays["draw"]).burn_out - 1e-6,
         "crashed": np.linalg.norm(y[:, :3], axis=1) < rocket.Re,
     }
+    if "draw" in arrays:
+        flights["dry"] = arrays["final_t"] >= failing.vehicles(rocket, arrays["draw"]).burn_out - 1e-6
+    return flights | {key: arrays[key] for key in ("target",) if key in arrays}
 
 
 # ---------------------------------------------------------------------------------------------------------------------

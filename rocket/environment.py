@@ -312,10 +312,10 @@ class RocketVectorEnv(BatchedEnv):
     def _new_targets(self, n):
         """New targets (n, 5). Those of groups come in pairs, from opposite ends of the ranges."""
         if self.training.flights_per_start == 1:
-            return self.targets.at(self.np_random.random((n, len(ELEMENTS))), self.rocket)
+            return self.mission.ranges.at(self.np_random.random((n, len(ELEMENTS))), self.rocket)
         half = self.np_random.random((-(-n // 2), len(ELEMENTS)))
         shares = np.stack([half, 1 - half], axis=1).reshape(-1, len(ELEMENTS))[:n]
-        return self.targets.at(shares, self.rocket)
+        return self.mission.ranges.at(shares, self.rocket)
 
     def _checked_targets(self, given):
         """The targets given to `reset`, one or each flight's own, as (N, 5). Raises BadInput for one that cannot be."""
@@ -623,7 +623,7 @@ def fly_rocket(
     `PARTS` as `parts` (K, 5), and the entries of the last step's `final_info`.
     """
     env: Any = gym.make_vec(env_id, num_envs=1, end_time=end_time, **options)  # a RocketVectorEnv
-    given = {} if draw is None else {"draw": [draw]}
+    given: dict[str, Any] = {} if draw is None else {"draw": [draw]}
     if env.targets is not None:
         given["target"] = own_target(env.rocket) if target is None else target
     if noise is not None and env.navigation_noise:

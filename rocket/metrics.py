@@ -138,15 +138,13 @@ def chosen(arrays: dict, flights: np.ndarray) -> dict:
     return {key: value[flights] for key, value in arrays.items()}
 
 
-def targets_of(mission: Mission, eval_seed: int, n: int) -> np.ndarray | None:
-    """The n targets (n, 5) of a seed: a (m), e, i, raan, argp (degrees). None where all fly to the rocket's orbit.
+def targets_of(mission: Mission, eval_seed: int, n: int) -> np.ndarray:
+    """The n targets (n, 5) of a seed: a (m), e, i, raan, argp (degrees), for a mission with ranges of targets.
 
     They are the same for every policy and guidance law.
     """
-    if mission.targets is None:
-        return None
     shares = np.random.default_rng([eval_seed, 5]).random((n, len(ELEMENTS)))
-    return mission.targets.at(shares, mission.rocket)
+    return mission.ranges.at(shares, mission.rocket)
 
 
 def evaluate_dispersed(
@@ -162,9 +160,8 @@ def evaluate_dispersed(
     mission = ROCKETS[env_id]
     rocket = env_options.get("rocket") or mission.rocket
     given = {"draw": draws(rocket, dispersion, eval_seed, n, env_options.get("failure", 0.0))}
-    targets = targets_of(mission, eval_seed, n)
-    if targets is not None:
-        given["target"] = targets
+    if mission.targets is not None:
+        given["target"] = targets_of(mission, eval_seed, n)
     flights = fly_batches(env_id, policy, eval_seed, given, at_once, dispersion=dispersion, **env_options)
     names = ("draw", "target", "final_y", "final_t", "final_error", "failure")
     arrays = {key: flights[key] for key in names if key in flights} | given

@@ -50,6 +50,12 @@ class Mission:
         """The ceiling in m, infinite without one."""
         return np.inf if self.ceiling_km is None else 1e3 * self.ceiling_km
 
+    @property
+    def ranges(self) -> Targets:
+        """The ranges of the targets, for a mission whose flights have their own."""
+        assert self.targets is not None
+        return self.targets
+
 
 # The paper penalises an overshoot beyond 250 km. The boosters burn until 150.4 s. At the fixed time speed has to be
 # wasted, and too flat a climb wastes it as well: with a floor of 110 km two of three seeds flew along the floor.

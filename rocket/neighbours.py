@@ -28,9 +28,11 @@ from common.policies import competitors, fly_by_script
 from common.tables import lines_of
 from rocket import guidance
 from rocket.any_orbit import masses, solve_targets, target_masses
+from rocket.comparison import recorded_flights
 from rocket.metrics import AT_ONCE, fly_batches, inside_box, targets_of
 from rocket.missions import ROCKETS, Mission
-from rocket.orbits import final_elements, specific_energy, target_orbit, terminal_error
+from rocket.orbits import specific_energy, target_orbit, terminal_error
+from rocket.rescue import Failing
 from rocket.targets import ELEMENTS, elements_of
 from rocket.vehicle import Rocket
 
@@ -65,7 +67,7 @@ def flown_optima(env_id: str, targets: np.ndarray, optima: list) -> Flights:
     times = guidance.middles(mission.rocket)
     u = np.stack([guidance.directions_at(optima[k], times) for k in found])  # (K, steps, 3)
     beyond = targets.copy()
-    beyond[:, 0] = 1.1 * mission.targets.corners(mission.rocket)[:, 0].max()
+    beyond[:, 0] = 1.1 * mission.ranges.corners(mission.rocket)[:, 0].max()
     beyond[:, 1] = 1 - targets[:, 0] * (1 - targets[:, 1]) / beyond[:, 0]  # the same perigee
     batch: Any = gym.make_vec(env_id, num_envs=len(found))
     obs, _ = batch.reset(options={"target": beyond})
@@ -76,7 +78,7 @@ def flown_optima(env_id: str, targets: np.ndarray, optima: list) -> Flights:
         y.append(np.where(step.flew[:, None], batch.y.T, y[-1]))
 
     fly_until_ended(batch, lambda obs, step: u[:, step], obs, record)
-    return Flights(targets, u[:, : len(flew)], np.moveaxis(y, 0, 1), np.sum(flew, axis=0))
+    return Flights(targets, u[:, : len(flew)], np.stack(y, axis=1), np.sum(flew, axis=0))
 
 
 def nearest(solved: np.ndarray, targets: np.ndarray, rocket: Rocket) -> np.ndarray:
@@ -262,9 +264,7 @@ def compare_targets(env_id: str, folder: Path, n: int, solved: int, eval_seed: i
     report = {"env_id": env_id, "eval_seed": eval_seed, "laws": {}}
     for name, path in checkpoints.items():
         metrics, arrays = fly_by_script(script, path, {"eval_starts": n, "eval_seed": eval_seed})
-        ends = final_elements(arrays["final_y"], rocket) | {"target": arrays["target"], "error": arrays["final_error"]}
-        ends |= {"final_mass_kg": arrays["final_y"][:, 6]}
-        ends["crashed"] = np.linalg.norm(arrays["final_y"][:, :3], axis=1) < rocket.Re
+        ends = recorded_flights(arrays, rocket, Failing()) | {"error": arrays["final_error"]}
         about = {"seconds_before": read_checkpoint(path)["counters"]["wall_seconds"], "solved": 0}
         report["laws"][name] = about | ended(ends, best, rocket)
     opponents = Opponents(env_id, eval_seed, n)
@@ -280,7 +280,9 @@ def compare_targets(env_id: str, folder: Path, n: int, solved: int, eval_seed: i
 
 def opponents_table(report: dict) -> str:
     """opponents.json as a table: a line for each competitor."""
-    rows = [("", "flights", "median", "p95", "worst", "in the box", "mass", "solves", "s before", "s each")]
+    rows: list[tuple[str, ...]] = [
+        ("", "flights", "median", "p95", "worst", "in the box", "mass", "solves", "s before", "s each")
+    ]
     for name, row in report["laws"].items():
         errors = [f"{row[f'error_{part}']:.6f}" for part in ("median", "p95", "max")]
         mass = f"{row['mass_ratio_mean']:.4%}" if "mass_ratio_mean" in row else "-"

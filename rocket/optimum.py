@@ -213,8 +213,8 @@ def ascent_program(case: AscentCase, mesh: AscentMesh):
     x0[3] += 1e-16  # |v_rel| has no derivative where it is 0, as it is on the ground
     interval = collocation(rocket) if mesh.points else zero_order_hold_step(rocket)
     defects, ends = interval.map(n)(ca.horzcat(x0, x[:, :-1]), z, u[:, mesh.column.tolist()], engine)
-    target = (ca.DM(vector) for vector in target_orbit(rocket.target, rocket.mu))
-    orbit = orbit_defect(rocket, ca.DM(scale) * x[:, -1], *target, ca.DM(target_axes(rocket)[:2]))
+    h, e = (ca.DM(vector) for vector in target_orbit(rocket.target, rocket.mu))
+    orbit = orbit_defect(rocket, ca.DM(scale) * x[:, -1], h, e, ca.DM(target_axes(rocket)[:2]))
     constraints = ca.veccat(defects, x - ends, ca.sum1(u**2) - 1, orbit, ca.sqrt(ca.sum1(x[:3, :] ** 2)))
     cost = end / (scale[0] / scale[3]) if case.free else ca.sumsqr(u[:, 1:] - u[:, :-1])
     return {"x": ca.veccat(x, z, u, end), "f": cost, "g": constraints}

@@ -154,7 +154,7 @@ def test_options_of_a_reset_that_do_not_fit_are_one_line():
         make(1).reset(options={"draw": np.zeros((1, 16))})
     with pytest.raises(BadInput, match="they may be 'draw' and 'noise'$"):
         make(1, dispersion=1.0).reset(options={"x0": 1})
-    with pytest.raises(BadInput, match="a rocket has none without dispersion, failure or navigation noise$"):
+    with pytest.raises(BadInput, match="a rocket has none without targets, dispersion, failure or navigation noise$"):
         make(1, None).reset(options={"noise": np.zeros((1, 600, 6))})
 
 
