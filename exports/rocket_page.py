@@ -173,7 +173,7 @@ def target_sliders(mission: Mission) -> list[dict]:
     The apogee's slider moves by its logarithm.
     """
     rocket = mission.rocket
-    own = apsides(rocket.a / 1e3, rocket.e, rocket)
+    own = {key: float(value) for key, value in apsides(rocket.a / 1e3, rocket.e, rocket).items()}
     rows = [
         ("perigee", "perigee", "km", mission.ranges.perigee_km, own["perigee_km"], 1.0, False),
         ("apogee", "apogee", "km", mission.ranges.apogee_km, own["apogee_km"], 0.01, True),

@@ -83,13 +83,13 @@ def assert_ends_alike(flight, error_norm, y, m=1.0):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("result", ["rocket_failures", "rocket_fixed"])
+@pytest.mark.parametrize("result", ["rocket_failures", "rocket_fixed", "rocket_any_orbit"])
 def test_with_all_sliders_at_zero_the_flight_is_pythons(result):
     metrics, arrays = read_evaluation(ROOT / "results" / result)
     flight = flights_of(result)["policy"]
     assert_ends_alike(flight, metrics["error_norm"], arrays["y"][-1])
     assert flight["t"][-1] == pytest.approx(metrics["final_time_s"], abs=1e-3)
-    np.testing.assert_allclose(flight["u"], arrays["u"], atol=1e-4)
+    np.testing.assert_allclose(flight["u"], arrays["u_own" if "u_own" in arrays else "u"], atol=1e-4)
     assert not flight["crashed"] and not flight["dry"]
 
 
@@ -107,6 +107,24 @@ def test_another_vehicle_flies_as_pythons(result):
         flown = fly_rocket(args.env_id, law, draw=z, dispersion=1.0)
         assert_ends_alike(flights[name], flown["error_norm"], flown["y"][-1], m=0.01)
         assert flights[name]["errorNorm"] == pytest.approx(flown["error_norm"], abs=1e-9)
+
+
+@pytest.mark.slow
+def test_any_orbit_flies_as_pythons():
+    """A target by the sliders' numbers is that of `Targets.at`, and the policy flies to it as by torch."""
+    agent, args, options = load(ROOT / "results" / "rocket_any_orbit" / "agent.safetensors")
+    mission = ROCKETS[args.env_id]
+    ranges = mission.ranges
+    shares = {"perigee": 0.3, "apogee": 0.6, "i": 0.8, "argp": 0.1}
+    (target,) = ranges.at([[0.3, 0.6, 0.8, 0.5, 0.1]], mission.rocket)
+    low, high = np.log(ranges.apogee_km)
+    place = {"apogee": float(np.exp(low + 0.6 * (high - low)))}
+    for name, span in (("perigee", ranges.perigee_km), ("i", ranges.i_deg), ("argp", ranges.argp_deg)):
+        place[name] = float(np.interp(shares[name], (0, 1), span))
+    changes = json.dumps({**NO_CHANGES, "target": place})
+    flight = engine_of("rocket_any_orbit")(f"flyAll(data, {changes}).policy")
+    flown = fly_rocket(args.env_id, agent.make_policy(600), target=target, **options)
+    assert_ends_alike(flight, flown["error_norm"], flown["y"][-1])
 
 
 @pytest.mark.slow

@@ -88,6 +88,26 @@ def test_a_rockets_page(opened):
     assert errors(page)[2] > 0.01
 
 
+def test_a_page_of_any_orbit(opened):
+    """The policy flies to where the sliders stand, and the target's ellipse moves along."""
+    page = opened("rocket_any_orbit")
+    metrics = json.loads((ROOT / "results" / "rocket_any_orbit" / "eval.json").read_text())
+    assert float(page.inner_text("#end tr:first-child").split()[1]) == pytest.approx(metrics["error_norm"], abs=1e-6)
+    ellipse = page.evaluate("Array.from(page.scene.target.geometry.attributes.position.array)")
+    move(page, "i", 36)
+    move(page, "apogee", 8.0)
+    policy = float(page.inner_text("#end tr:first-child").split()[1])
+    assert policy < 0.005
+    rows = dict(line.split("\t", 1) for line in page.inner_text("#end").splitlines())
+    flown, _, target = map(float, rows["inclination (°)"].split())
+    assert target == 36.0 and flown == pytest.approx(36.0, abs=0.05)
+    assert page.evaluate("Array.from(page.scene.target.geometry.attributes.position.array)") != ellipse
+    page.select_option("#stored", "5")
+    page.wait_for_function("() => document.getElementById('nearest').innerText.endsWith('of this orbit.')")
+    page.click("#reset")
+    page.wait_for_function("() => page.changes.target === null && page.rocket === page.data.rocket")
+
+
 def test_time_runs_and_views_change(opened):
     page = opened("two_stage_leo")
     page.select_option("#speed", "100")
