@@ -1,7 +1,7 @@
 """Flights to many targets: their optima and their evaluation.
 
-Each flight has its own target orbit. `targets.py` has the ranges. Reading order: targets of a seed, their optima, the
-evaluation. CasADi is imported only where it solves.
+Each flight has its own target orbit. `targets.py` has the ranges. Reading order: the optima, the evaluation. CasADi is
+imported only where it solves.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from common.errors import NoOptimum
 from common.files import DAMAGED_NPZ
 from common.workers import Workers, usable_cores
 from rocket import guidance
-from rocket.dispersion import Vehicles, draw_names, draw_vehicles
+from rocket.dispersion import check_drawable, draw_names, draw_vehicles
 from rocket.environment import fly_rocket
 from rocket.metrics import fly_batches, inside_box, targets_of
 from rocket.missions import Mission
@@ -36,18 +36,14 @@ OF_FEW = 30  # of those of a small evaluation, which a training makes on its way
 FLIGHTS_PER_PROCESS = 50  # a process takes two seconds to start, a solve half of one
 
 
-def nominal_vehicle(rocket: Rocket) -> Vehicles:
-    """The rocket as the table has it, as a drawn vehicle (N = 1)."""
-    return draw_vehicles(rocket, 0.0, np.zeros((1, len(draw_names(rocket)))))
-
-
 def solve_target(job) -> dict | None:
     """The optimum of one target, as `optimise_remaining` returns it, or None. job is (rocket, target (5,), guesses)."""
     rocket, target, guesses = job
-    vehicle = nominal_vehicle(rocket)
+    vehicle = draw_vehicles(rocket, 0.0, np.zeros((1, len(draw_names(rocket)))))  # as the table has it
     elements = elements_of(target)
     orbit = target_orbit(elements, rocket.mu)
-    ascent = guidance.vehicle_ascent(vehicle, 0.0, rocket.x0[:6], vehicle.burn_out[0], orbit)
+    last_end = min(vehicle.burn_out[0], rocket.end_time)
+    ascent = guidance.vehicle_ascent(vehicle, 0.0, rocket.x0[:6], last_end, orbit)
     ascent = ascent._replace(axes=target_axes(rocket, elements)[:2])
     for guess in guesses:
         try:
@@ -61,10 +57,11 @@ def solve_targets(env_id: str, mission: Mission, targets: np.ndarray, processes:
     """The optima of targets (n, 5), as `solve_target` returns them.
 
     They are looked for from the optimum of the rocket's own orbit, and then from that of the middle of all ranges.
+    Raises BadInput for a rocket that cannot be drawn (`check_drawable`).
     """
     rocket = mission.rocket
-    own = guidance.guess_of(kept_reference(env_id, mission))
-    guesses = [own]
+    check_drawable(rocket)
+    guesses = [guidance.guess_of(kept_reference(env_id, mission))]
     middle = solve_target((rocket, mission.ranges.corners(rocket)[0], guesses))
     if middle:
         guesses.append(middle)
@@ -85,7 +82,7 @@ def flown_to(env_id: str, targets: np.ndarray, optima: list) -> list[dict]:
 
 def references(n: int) -> int:
     """How many of an evaluation's n targets have their optimum."""
-    return min(n, REFERENCES if n > REFERENCES else OF_FEW)
+    return min(n, REFERENCES if n >= REFERENCES else OF_FEW)
 
 
 def about(env_id: str, mission: Mission, eval_seed: int) -> str:
@@ -132,7 +129,6 @@ def in_words(target: np.ndarray, rocket: Rocket) -> str:
 # ---------------------------------------------------------------------------------------------------------------------
 # Evaluation
 # ---------------------------------------------------------------------------------------------------------------------
-
 
 RECORDED = 20  # flights whose directions are kept
 
