@@ -412,6 +412,9 @@ def curriculum(args, progress):
     --log-std is a schedule. It is at most TERMINAL_SCALE. It is at least 0.001 where flights differ, because a smaller
     scale is no better there.
 
+    Where flights have targets of their own, a fifth of the draws of each number lies at an end of its range. A network is
+    least accurate at the edge of what it has seen.
+
     With failures at random moments, every second update flies failures of the last stage at its ignition. They are the
     hardest to save, and rare among random ones.
     """
@@ -424,6 +427,8 @@ def curriculum(args, progress):
         std = math.exp(args.log_std.at(progress))
         smallest = 0.001 if flights_differ(args) else 0.0
         training["terminal_scale"] = min(TERMINAL_SCALE, max(std / 8, smallest))
+    if ROCKETS[args.env_id].targets is not None:
+        training["target_ends"] = 0.2
     if args.failure and args.failure_time == "random":
         updates_before = round(progress * (args.total_updates - 1))
         training["failure_time"] = "ignition" if updates_before % 2 else "random"

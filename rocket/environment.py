@@ -73,6 +73,8 @@ class RocketTraining(Training):
     guidance: bool = switch()  # pay R_guidance
     # reward lost per `mass_unit` of propellant burnt in the last phase; our script pays `mass_rewards` instead
     propellant_price: float = numeric(0.0)
+    # of the draws of each number of a target, the share that lies at the ends of its range
+    target_ends: float = numeric(0.0, high=0.9)
     # "ignition" for a while where the environment's `failure_time` is "random" (None: the environment's)
     failure_time: str | None = checked(
         None,
@@ -312,9 +314,12 @@ class RocketVectorEnv(BatchedEnv):
     def _new_targets(self, n):
         """New targets (n, 5). Those of groups come in pairs, from opposite ends of the ranges."""
         if self.training.flights_per_start == 1:
-            return self.mission.ranges.at(self.np_random.random((n, len(ELEMENTS))), self.rocket)
-        half = self.np_random.random((-(-n // 2), len(ELEMENTS)))
-        shares = np.stack([half, 1 - half], axis=1).reshape(-1, len(ELEMENTS))[:n]
+            shares = self.np_random.random((n, len(ELEMENTS)))
+        else:
+            half = self.np_random.random((-(-n // 2), len(ELEMENTS)))
+            shares = np.stack([half, 1 - half], axis=1).reshape(-1, len(ELEMENTS))[:n]
+        at_ends = self.training.target_ends
+        shares = np.clip((shares - at_ends / 2) / (1 - at_ends), 0.0, 1.0)
         return self.mission.ranges.at(shares, self.rocket)
 
     def _checked_targets(self, given):

@@ -13,7 +13,9 @@ import torch
 import envs
 import ppo_gtrxl_rocket as script
 from common.errors import NoOptimum
+from common.tasks import task_of
 from envs import ROCKET, ROCKETS, BadInput
+from exports.rocket import interface
 from rocket import guidance, neighbours
 from rocket.any_orbit import refuse_unreachable, solve_target, solve_targets, target_masses
 from rocket.metrics import element_misses, targets_of
@@ -163,6 +165,17 @@ def test_groups_share_a_target_and_come_in_pairs():
     assert len(np.unique(batch.target[:, 0])) == 8
 
 
+def test_a_training_draws_more_at_the_ends():
+    batch = make(400)
+    batch.reset(seed=0, options={"training": {"target_ends": 0.2}})
+    i = batch.target[:, 2]
+    at_ends = [np.isclose(i, end) for end in RANGES.i_deg]
+    assert all(0.06 < ends.mean() < 0.14 for ends in at_ends)
+    inside = i[~np.any(at_ends, axis=0)]
+    assert np.mean(inside) == pytest.approx(np.mean(RANGES.i_deg), abs=0.6)
+    assert np.std(inside) == pytest.approx(np.diff(RANGES.i_deg)[0] / 12**0.5, rel=0.1)
+
+
 def test_southern_launches_keep_their_direction():
     rocket = replace(ROCKET, i=60.0, raan=(180 - envs.launch_raan(28.5, 60.0)) % 360)
     targets = replace(RANGES, i_deg=(60.0, 60.0)).at([[0.5] * 5], rocket)
@@ -239,3 +252,10 @@ def test_the_nearest_of_the_solved_flown_to_another_target():
         errors[name] = float(neighbours.fly_until_ended(batch, law, obs)["error_norm"][0])
     assert errors["itself"] < 2e-5
     assert errors["LQR"] < 0.1 * errors["open loop"]  # first order is nulled, the second order stays
+
+
+def test_an_export_names_every_number_that_is_seen():
+    for options in ({}, {"observe_draw": True, "dispersion": 1.0}):
+        named = interface(task_of(ANY), action_frame="local", **options)
+        assert len(named.observation) == make(1, **options).single_observation_space.shape[0]
+    assert "n = target_normal" in named.notes
