@@ -412,8 +412,8 @@ def curriculum(args, progress):
     --log-std is a schedule. It is at most TERMINAL_SCALE. It is at least 0.001 where flights differ, because a smaller
     scale is no better there.
 
-    Where flights have targets of their own, a fifth of the draws of each number lies at an end of its range. A network is
-    least accurate at the edge of what it has seen.
+    Where flights have targets of their own, a fifth of the draws of each number lies at an end of its range. A network
+    is least accurate at the edge of what it has seen.
 
     With failures at random moments, every second update flies failures of the last stage at its ignition. They are the
     hardest to save, and rare among random ones.
