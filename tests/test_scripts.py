@@ -80,6 +80,7 @@ def shared(text):
 # by script, the lines of the shared sections that only it has; they end with "# this problem"
 ITS_OWN = {
     "ppo_gtrxl_rocket": [
+        "self.sees_target = ROCKETS[args.env_id].targets is not None",
         "self.direct = None",
         "if args.direct_differences:",
         "self.direct = linear(len(DIFFERENCES), d, gain=0.0, bias=None)",
@@ -583,7 +584,7 @@ def test_phases_are_one_hot_whatever_their_number(env_id):
     """The environment shows the phases as 0, 1 / (n - 1) .. 1."""
     buffers = ROCKET.constants(env_id)
     number = len(ROCKET.ROCKETS[env_id].rocket.burns)
-    agent = SimpleNamespace(**{name: torch.tensor(value) for name, value in buffers.items()})
+    agent = SimpleNamespace(sees_target=False, **{name: torch.tensor(value) for name, value in buffers.items()})
     obs = torch.tensor([[6.4e6, 0.0, 0.0, 0.0, 7e3, 0.0, 1e4, 0.5, phase] for phase in np.linspace(0, 1, number)])
     seen = ROCKET.features(agent, obs.float())
     (columns,) = np.nonzero((seen != seen[0]).any(0).numpy())
