@@ -18,13 +18,13 @@ sys.path.insert(0, str(ROOT))
 import evaluate  # noqa: E402
 
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
-CHANGES = {"thrust": -1, "drag": 20, "time": 400}  # %, %, s: the three laws are apart, and none has crashed
+CHANGES = {"apogee": 8.7, "i": 37, "perigee": 220}  # log km, degrees, km
 
 
 def draw(target: Path):
-    """Open the page of results/rocket_dispersed, move the sliders to CHANGES, and take a picture."""
+    """Open the page of results/rocket_any_orbit, move the sliders to CHANGES, look at the orbit and take a picture."""
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
-        file = evaluate.page(ROOT / "results" / "rocket_dispersed", Path(folder) / "page.html")
+        file = evaluate.page(ROOT / "results" / "rocket_any_orbit", Path(folder) / "page.html")
         browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=FLAGS)
         page = browser.new_page(viewport={"width": 1280, "height": 795})
         page.goto(file.as_uri())
@@ -32,7 +32,10 @@ def draw(target: Path):
         for slider, value in CHANGES.items():
             page.evaluate(f"document.getElementById('{slider}').value = {value}")
             page.dispatch_event(f"#{slider}", "input")
-            page.wait_for_timeout(1000)  # ms, until all laws have flown
+            page.wait_for_timeout(1000)  # ms, until the policy has flown
+        page.click("[data-view=orbit]")
+        page.evaluate("page.show(page.end)")
+        page.wait_for_timeout(500)
         page.screenshot(path=target)
         browser.close()
 
