@@ -246,9 +246,7 @@ FIXED_OPTIONS = {"action_frame": "local"}  # arguments that no flag sets; local 
 INITIAL_ACTION = [1.0, 0.0, 0.0]  # straight up (local frame), since a randomly steered rocket never leaves the ground
 STATE = slice(None)  # what tells the returns of one start's flights apart: all that is observed (`returns_baseline`)
 OBSERVED = 9  # numbers that every rocket shows: r, v, m, t_norm, phase; the draw comes after them
-TOLD = (
-    8  # numbers of a flight's own target: unit vectors to its perigee and normal to its plane, momentum, eccentricity
-)
+TOLD = 8  # numbers of a flight's own target: unit vectors to its perigee and normal to its plane, then |h| and |e|
 LENGTH = 64  # in 100 km, about the Earth's radius
 SPEED = 8  # in km/s, about the circular speed at that radius
 LAST_STEP = 0.004  # of that speed: about what the last stage gains in a step

@@ -275,11 +275,8 @@ def solve_from_guess(case: AscentCase, mesh: AscentMesh, guess: dict, clock: Sol
 # ---------------------------------------------------------------------------------------------------------------------
 
 FIXED, CUTOFF = "RocketAscent-v0", "RocketAscentCutoff-v0"
-STORED = {
-    CUTOFF: "free",
-    "RocketAscentAnyOrbit-v0": "free",
-    FIXED: "fixed_capped",
-}  # the keys of the paper's references; another id is its own key
+# the keys of the paper's references; another id is its own key
+STORED = {CUTOFF: "free", "RocketAscentAnyOrbit-v0": "free", FIXED: "fixed_capped"}
 RESULTS = Path(__file__).parents[1] / "results"
 MISS_TOLERANCE = 2e-5  # of a spline in flight; a stored reference may miss by 1.01 times its miss when it was solved
 HOLD_TOLERANCE = 2e-4  # largest terminal error of a spline's flight, if the steps themselves cannot be solved
