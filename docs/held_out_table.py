@@ -22,6 +22,7 @@ HELD_OUT = {  # result folder -> its name on the page
     "rocket_cutoff": "Rocket with cut-off",
     "rocket_dispersed": "The same, every flight another vehicle",
     "rocket_failures": "The same, an engine may lose thrust",
+    "rocket_any_orbit": "The same, any orbit of a range",
     "two_stage_leo": "Two stages",
     "mars_landing": "Landing on Mars",
 }
@@ -40,6 +41,12 @@ FIGURES = (  # the numbers of a held-out row: those of the first line whose keys
         "failure_mass_short_mean_kg": ("short of the optimum", 1, 1, " kg"),
     },
     {"dispersed_error_median": ("‖error‖, median", 1, 5, ""), "dispersed_box_rate": ("in the box", 100, 1, " %")},
+    {
+        "target_error_median": ("‖error‖, median", 1, 5, ""),
+        "target_error_p95": ("‖error‖, p95", 1, 4, ""),
+        "target_box_rate": ("in the box", 100, 1, " %"),
+        "target_mass_ratio_mean": ("mass / optimum's", 100, 2, " %"),
+    },
     {
         "error_norm": ("‖error‖", 1, 6, ""),
         "mass_ratio_reached": ("mass / optimum's for the orbit reached", 100, 3, " %"),

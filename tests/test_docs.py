@@ -32,7 +32,7 @@ PAGES = [ROOT / f"{name}.md" for name in ("README", "CHANGELOG", "CONTRIBUTING",
 PAGES += sorted((ROOT / "docs").rglob("*.md"))
 PAGES += sorted((ROOT / "results").rglob("README.md"))  # they hold the commands of all results
 each_page = pytest.mark.parametrize("page", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
-ROCKETS = ("rocket_fixed", "rocket_cutoff", "rocket_dispersed", "rocket_failures", "two_stage_leo")
+ROCKETS = ("rocket_fixed", "rocket_cutoff", "rocket_dispersed", "rocket_failures", "rocket_any_orbit", "two_stage_leo")
 GO_ON_FROM = {
     "rocket_dispersed": ["rocket_cutoff"],
     "rocket_failures": ["memory/nominal/no_blocks", "memory/rocket/no_blocks"],
@@ -123,6 +123,11 @@ def measured(result, found):
     if "failure_saved_rate" in found:
         here = [(100 * found["failure_saved_rate"], 1, " %"), (found["failure_error_median"], 5, "")]
         return [([100.0], 0, " %")], [*here, (found["failure_mass_short_mean_kg"], 1, " kg")]
+    if "target_starts" in found:
+        best = json.loads((ROOT / "results" / result / "opponents.json").read_text())["laws"]["IPOPT for each"]
+        optimum = [(np.array([best["error_median"]]), 6, ""), (np.array([100 * best["box_rate"]]), 0, " %")]
+        here = [(found["target_error_median"], 5, ""), (100 * found["target_box_rate"], 1, " %")]
+        return optimum, [*here, (100 * found["target_mass_ratio_mean"], 2, " %")]
     optimum, here = [(found["reference_error_norm"], 6, "")], [(found["error_norm"], 6, "")]
     if "dispersed_error_median" in found:
         best = json.loads((ROOT / "results" / result / "opponents.json").read_text())["laws"]["optimum"]
