@@ -182,10 +182,10 @@ FAILING = {  # replaces values of DISPERSED; training begins with a policy of he
     "direct_differences": True,  # a failure makes them large, and the blocks go on wrongly beyond what they have seen
     "mass_weight": "0.1:0 0.2:1 0.5:1 0.85:0",  # so that failed flights burn less
 }
-ANY_ORBIT = {  # replaces values of CUTOFF where every flight has its own target: six targets an update
+ANY_ORBIT = {  # replaces values of CUTOFF where every flight has its own target: at first six targets an update
     "total_updates": 400,
     "num_envs": 96,
-    "flights_per_start": 16,
+    "flights_per_start": "0:16 0.65:16 0.65:8",  # late, more targets an update teach more than more flights of each
     "num_minibatches": 16,
     "log_std": "0:-1 0.4:-3.5 1:-5.8",  # many orbits need longer at every size of noise
     "mass_weight": "0.1:0 0.2:2 0.7:2 0.95:0",
