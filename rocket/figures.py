@@ -240,8 +240,8 @@ def targets_figure(rocket: Rocket, arrays: dict, title: str) -> Figure:
             ax.plot(across[known], values[known], ".", markersize=3, alpha=0.5)
             ax.set(xlabel=name, ylabel=label, yscale=scale)
             ax.grid(alpha=0.3)
-            for k in known[np.argsort(values[known])[-3:]]:
-                ax.annotate(f"{k}", (across[k], values[k]), xytext=(4, 2), textcoords="offset points", fontsize=8)
+            for k, aside in zip(known[np.argsort(values[known])[-3:]], ((4, -9), (-22, -4), (4, 3))):
+                ax.annotate(f"{k}", (across[k], values[k]), xytext=aside, textcoords="offset points", fontsize=8)
         axes[0].set(xscale="log")
     figure.suptitle(f"{title}. Numbers are those of the worst targets, from 0")
     return figure
