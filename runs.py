@@ -521,6 +521,7 @@ class Run:
             self.counters = saved["counters"]
         self.began = time.monotonic() - self.counters["wall_seconds"]
         self.update_began = time.monotonic()
+        self.first_line: Any = None  # updates and seconds at the first printed line
 
     @property
     def updates_done(self):
@@ -639,7 +640,12 @@ class Run:
         done = self.counters["total_updates"]
         of = self.args.total_updates
         seconds = time.monotonic() - self.began
-        clock = f"{seconds / 60:.1f} min gone, {(of - done) * seconds / done / 60:.1f} to go"
+        clock = f"{seconds / 60:.1f} min gone"
+        if self.first_line is None:  # the first update also starts everything, so it tells nothing about the others
+            self.first_line = done, seconds
+        else:
+            first, seconds_before = self.first_line
+            clock += f", {(of - done) * (seconds - seconds_before) / (done - first) / 60:.1f} to go"
         line = f"update {done}/{of}, {self.counters['global_step']} steps, {clock}"
         print(f"{line}: {self.describe(episodes, self.metrics)}", flush=True)
 

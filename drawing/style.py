@@ -20,6 +20,11 @@ TARGET_ORBIT = {**TARGET, "linewidth": 4.0, "alpha": 0.4}  # beneath the lines o
 BOUNDARY = {"color": "0.5", "linewidth": 0.8, "linestyle": ":"}
 
 
+def in_tonnes(mass: float, digits: int) -> str:
+    """A mass (kg) in words: in t, below one of them in kg."""
+    return f"{mass:.0f} kg" if mass < 1e3 else f"{mass / 1e3:.{digits}f} t"
+
+
 def save_figures(folder, figures: dict[str, Figure]) -> list[Path]:
     """Write figures by their file names, in 256 colours, which take a quarter of the size. Returns the paths."""
     folder = Path(folder)

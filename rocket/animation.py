@@ -9,7 +9,7 @@ from matplotlib.path import Path as Outline
 from matplotlib.transforms import Affine2D
 
 from drawing.animation import DOT, LOOKS, SIDES, Animation, Flight, Sheet, room
-from drawing.style import BOUNDARY, OPTIMUM, POLICY, TARGET_ORBIT
+from drawing.style import BOUNDARY, OPTIMUM, POLICY, TARGET_ORBIT, in_tonnes
 from rocket.dispersion import Vehicles
 from rocket.orbits import orbit_vectors, orbital_elements, target_axes
 from rocket.vehicle import Rocket, engine_groups
@@ -217,7 +217,7 @@ def stagings(rocket: Rocket, vehicle: Vehicles | None) -> list[tuple[float, str]
     for burn, end, mass in zip(rocket.burns[:-1], ends, dropped):
         number = sum(n for n, _ in burn.dropped)
         engines = f"{number} engine{'s' * (number != 1)}, " if number else ""
-        told.append((end, f"{end:.0f} s: {engines}{mass / 1e3:.1f} t dropped"))
+        told.append((end, f"{end:.0f} s: {engines}{in_tonnes(mass, 1)} dropped"))
     return told
 
 

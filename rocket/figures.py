@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Rectangle
 
-from drawing.style import BOUNDARY, OPTIMUM, POLICY, TARGET, TARGET_ORBIT
+from drawing.style import BOUNDARY, OPTIMUM, POLICY, TARGET, TARGET_ORBIT, in_tonnes
 from rocket.losses import STANDARD
 from rocket.metrics import BOX, altitude_km, apsides, element_misses, wilson
 from rocket.missions import Mission
@@ -71,7 +71,7 @@ def label_ascent(panels: dict, velocity: list, rocket: Rocket):
         ax.set_ylabel(f"velocity $v_{axis}$ (km/s), pale", color="0.4")
         ax.tick_params(axis="y", colors="0.4")
     for k, (burn, dropped) in enumerate(zip(rocket.burns[:-1], rocket.jettison)):  # the last burn drops nothing
-        text, height = f" {burn.end:g} s: {dropped / 1e3:.2f} t dropped", 0.9 - 0.15 * (k % 5)  # of the axes
+        text, height = f" {burn.end:g} s: {in_tonnes(dropped, 2)} dropped", 0.9 - 0.15 * (k % 5)  # of the axes
         side = "left" if burn.end <= rocket.end_time / 2 else "right"  # text towards the middle stays in the panel
         where = {"transform": panels["mass"].get_xaxis_transform(), "horizontalalignment": side}
         panels["mass"].text(burn.end, height, text if side == "left" else f"{text.strip()} ", fontsize=9, **where)

@@ -86,6 +86,7 @@ def new_problem(monkeypatch):
     def register(problem):
         like = gym.spec("VanDerPol-v0")
         spec = dataclasses.replace(like, id=problem.env_id, kwargs={"env_id": problem.env_id})
+        monkeypatch.delitem(envs.PROBLEMS, problem.env_id, raising=False)  # a user's table may have the id
         monkeypatch.setitem(envs.PROBLEMS, problem.env_id, problem)
         monkeypatch.setitem(gym.registry, problem.env_id, spec)
         return problem.env_id
