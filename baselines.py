@@ -39,6 +39,7 @@ from common.workers import Workers, usable_cores
 from envs import DOUBLE_INTEGRATOR, TABLES_OF_FILES
 from phased.environment import fly
 from phased.lqr import linearise, lqr, lqr_policy, riccati
+from phased.metrics import say_what_is_beyond
 from phased.optimum import StartJob, agrees, best_solution, coarse, controls_of, hermite_simpson, refined, shooting
 from phased.problem import PROBLEMS, Problem, flights_of_seed, starts
 from phased.task import PhasedTask
@@ -345,7 +346,11 @@ def compare_finer(env_id: str, x0, flight: dict, draw) -> dict:
     jobs = [StartJob(env_id, shooting, problem.circles_count, k, x0[k], draw[k]) for k in some]
     best = [best_solution(job)[0] for job in jobs]
     doubtful = min(best, key=lambda solution: solution.guesses_agree)
-    numbers: dict[str, float] = {"guesses": doubtful.guesses, "guesses_agree": doubtful.guesses_agree}
+    numbers: dict[str, float] = {
+        "finer_starts": len(jobs),
+        "guesses": doubtful.guesses,
+        "guesses_agree": doubtful.guesses_agree,
+    }
     for name, limits in (("bound_price", problem.bounds), ("constraint_price", problem.constraints)):
         if not limits:
             continue
@@ -408,7 +413,7 @@ def kept_reference(env_id: str, problem: Problem, eval_seed: int, n: int) -> dic
     x0, draw = flights_of_seed(problem, eval_seed, n)
     count = len(np.unique(np.hstack([x0, draw]), axis=0))
     if env_id != DOUBLE_INTEGRATOR.env_id and count > 1:
-        print(f"solving the optima of {count} starts, once", file=sys.stderr, flush=True)
+        print(f"solving the optima of {count} starts of seed {eval_seed}, once", file=sys.stderr, flush=True)
     return reference(env_id, x0, draw=draw)
 
 
@@ -418,6 +423,7 @@ def report(env_id: str, n: int, seed: int) -> tuple[dict, dict]:
     x0, draw = flights_of_seed(problem, seed, n)
     begin = time.perf_counter()
     flight = reference(env_id, x0, draw=draw)
+    say_what_is_beyond(problem, flight["x"])
     solved = summarise(problem, flight) | compare(env_id, x0, flight, draw)
     seconds = time.perf_counter() - begin  # with the finer solves
     numbers = {"env_id": env_id, "starts": n, "seed": seed, "solve_seconds": seconds, **solved}

@@ -5,6 +5,8 @@ The names of all metrics (eval.json) and arrays (eval.npz) are the project's int
 
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 
 from phased.problem import Problem
@@ -34,6 +36,15 @@ def flight_metrics(problem: Problem, flight: dict, reference: dict) -> dict:
         metrics[f"hit_rate_phase_{k}"] = float(rate)
     metrics["terminal_error_max"] = float(flight["terminal_error"].max())
     return metrics
+
+
+def say_what_is_beyond(problem: Problem, x: np.ndarray) -> None:
+    """Print a line if flights x (n, T+1, states) leave the observations' box, so that the table's `x_max` is wrong."""
+    most = np.nanmax(np.abs(x), axis=(0, 1))
+    for k in np.flatnonzero(most > problem.x_max):
+        name = problem.x_names[k] if problem.x_names else f"x{k + 1}"
+        line = f"{problem.env_id}: the state {name} reaches {most[k]:.4g}, beyond its x_max of {problem.x_max[k]:g}"
+        print(f"{line}, which must be larger than every state that can be reached", file=sys.stderr)
 
 
 def hits_every_circle(problem: Problem, x: np.ndarray, p: tuple) -> np.ndarray:

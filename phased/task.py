@@ -10,7 +10,7 @@ import numpy as np
 from common.command_line import integer
 from common.tasks import SampledTask
 from phased.environment import fly
-from phased.metrics import flight_metrics, near_origin_metrics, ratio_metrics
+from phased.metrics import flight_metrics, near_origin_metrics, ratio_metrics, say_what_is_beyond
 from phased.problem import Problem, flights_of_seed
 from phased.table import table
 
@@ -42,6 +42,7 @@ class PhasedTask(SampledTask):
             reference = self.optimum(eval_seed, n)
         if not np.array_equal(reference["x"][:, 0], x0):
             raise ValueError(f"reference does not belong to the {n} starts of eval_seed {eval_seed}")
+        say_what_is_beyond(problem, flight["x"])
         compared = np.ones(n, dtype=bool)
         for side in (flight, reference):
             if problem.circles_count:

@@ -43,16 +43,19 @@ class Engine:
 
     def __post_init__(self):
         refuse_unless(isinstance(self.name, str), "an engine's name", repr(self.name), "must be a string")
-        refuse_unless_finite("an engine's", self)
-        for name in ("total_mass", "burn_time", "isp"):
-            refuse_unless(getattr(self, name) > 0, f"an engine's {name}", getattr(self, name), "must be positive")
-        allowed = f"must be between 0 and its total_mass, {self.total_mass} kg"
-        refuse_unless(0 <= self.propellant <= self.total_mass, "an engine's propellant", self.propellant, allowed)
-        refuse_unless(self.thrust >= 0, "an engine's thrust", self.thrust, "must not be negative")
+        whose = f"engine {self.name!r}'s" if self.name else "an engine's"
+        refuse_unless_finite(whose, self)
+        mass = self.total_mass
+        refuse_unless(mass > 0, f"{whose} total_mass", mass, "must be positive")
+        for name in ("burn_time", "isp"):
+            allowed = f"must be positive, also of what only drops off, as a fairing; the engine has {mass:g} kg"
+            refuse_unless(getattr(self, name) > 0, f"{whose} {name}", getattr(self, name), allowed)
+        allowed = f"must be between 0 and its total_mass, {mass} kg"
+        refuse_unless(0 <= self.propellant <= mass, f"{whose} propellant", self.propellant, allowed)
+        refuse_unless(self.thrust >= 0, f"{whose} thrust", self.thrust, "must not be negative")
         burns = self.propellant > 0 or self.thrust == 0
-        refuse_unless(burns, "an engine's propellant", self.propellant, "must be positive where it has thrust")
+        refuse_unless(burns, f"{whose} propellant", self.propellant, "must be positive where it has thrust")
         if self.thrust and abs(self.flown_isp / self.isp - 1) > ISP_TOLERANCE:
-            whose = f"engine {self.name!r}'s" if self.name else "an engine's"
             flown = f"its thrust, propellant and burn_time make {self.flown_isp:.4g} s, and these three rule"
             consistent = f"a burn_time of {self.propellant * G0 * self.isp / self.thrust:.6g} s would agree"
             warnings.warn(f"{whose} isp is {self.isp:g} s, but {flown}; {consistent}", stacklevel=3)

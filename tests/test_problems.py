@@ -640,6 +640,15 @@ def test_a_slip_in_a_table_is_one_line_that_names_the_field(slip):
     assert "\n" not in str(refused.value)
 
 
+def test_an_x_max_that_is_too_small_is_said(new_problem, capsys):
+    new_problem(Problem("Wide-v0", lambda x, u: (x[1], u), 1.0, (PHASE,), (1.6, 1.0), x0_max=(1.5, 1.0)))
+    baselines.report("Wide-v0", 20, 0)
+    said = capsys.readouterr().err
+    assert re.search(
+        "^Wide-v0: the state x1 reaches 1.[7-9].*, beyond its x_max of 1.6, which must be larger", said, re.M
+    )
+
+
 def test_an_id_that_is_taken_is_refused():
     mine = Problem("VanDerPol-v0", spring, 1.0, (PHASE,), (20.0, 20.0))
     with pytest.raises(BadInput, match="^env_id is 'VanDerPol-v0'; it must be a new id such as Mine-v0"):
