@@ -65,7 +65,7 @@ def page(task: RocketTask, metrics: dict, arrays: dict, checkpoint: dict, launch
         "policy": policy | {"options": options, "sees_target": not alike},
         "python": {key: metrics[key] for key in ("error_norm", "final_mass_kg", "final_time_s")},
     }
-    return Page("ascent", f"{env_id}: fly it", data)
+    return Page("ascent", f"{env_id}: an ascent to orbit, flown by a neural network beside the optimum", data)
 
 
 def constants(mission: Mission, dispersion: float) -> dict:

@@ -11,6 +11,7 @@ class AscentPage {
     this.changes = { ...NO_CHANGES };
     this.time = 0;
     this.element = (id) => document.getElementById(id);
+    this.element("longitude").textContent = data.launch_longitude;
     this.optimum = storedFlight(data.optimum, data.rocket);
     this.showLaws();
     this.altitude = new Chart(this.element("altitude"), { x: "time (s)", y: "altitude (km)" });
@@ -24,7 +25,7 @@ class AscentPage {
       `The same policy flown by Python, nominal vehicle: ‖error‖ ${error_norm.toFixed(7)}, ` +
       `${final_mass_kg.toFixed(2)} kg, ${final_time_s.toFixed(2)} s.`;
     this.fly();
-    this.scene.look("ascent");
+    this.look("ascent");
     window.addEventListener("resize", () => this.drawCharts());
   }
 
@@ -34,13 +35,20 @@ class AscentPage {
     try {
       const scene = new Scene(container, this.data);
       container.querySelectorAll("button").forEach((button) => {
-        button.addEventListener("click", () => scene.look(button.dataset.view));
+        button.addEventListener("click", () => this.look(button.dataset.view));
       });
       return scene;
     } catch (error) {
       container.textContent = `No picture in three dimensions: ${error.message}`;
       return { setFlights() {}, setRocket() {}, show() {}, look() {} };
     }
+  }
+
+  look(view) {
+    this.scene.look(view);
+    document.querySelectorAll("[data-view]").forEach((button) => {
+      button.setAttribute("aria-pressed", button.dataset.view === view);
+    });
   }
 
   // Leave out what a page of any orbit does not have: classical laws about one optimum, and other vehicles.

@@ -45,6 +45,10 @@ class PlanePage {
   moveTo(point) {
     const { x0_max } = this.problem;
     this.start = point.map((value, k) => clamp(value || 0, -x0_max[k], x0_max[k]));
+    const isInside = point.every((value, k) => Math.abs(value) <= x0_max[k]);
+    document.getElementById("box").textContent = isInside
+      ? ""
+      : `Starts lie within ±${x0_max[0]} and ±${x0_max[1]}: the policy has learned from these alone.`;
     if (!this.isWaiting) {
       this.isWaiting = true;
       requestAnimationFrame(() => {

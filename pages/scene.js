@@ -3,7 +3,7 @@
 // The globe and the flights in three dimensions, by three.js. Lengths are in Earth radii, axes those of ECI.
 // It needs numbers.js, rocket_laws.js, chart.js for its colours, vendor/three.min.js and vendor/coastlines.js.
 
-const LIGHT = { ...COLORS, optimum: "#6ab0e0", openLoop: "#aaaaaa", target: "#5bd65b" }; // on a dark ground
+const LIGHT = { ...COLORS, policy: "#ff6b61", optimum: "#6ab0e0", openLoop: "#aaaaaa", target: "#5bd65b" }; // on a dark ground
 
 class Scene {
   constructor(container, data) {
