@@ -52,6 +52,15 @@ KNOWLEDGE = {  # what each opponent has to know
     "replan_hint": "its own exhaust velocity, drawn + IPOPT on board",
     "optimum": "the draw itself",
 }
+IN_WORDS = {  # the names of the laws in figures, where they are not their own words
+    "replay": "open loop",
+    "tvlqr": "LQR",
+    "tvlqr_energy": "LQR by energy",
+    "replan": "replanning",
+    "replan_measured": "replanning, acceleration measured",
+    "replan_after_lqr": "LQR, then replanning",
+    "replan_hint": "replanning with a hint",
+}
 REPLANS = ("replan", "replan_measured", "replan_after_lqr", "replan_hint")
 # with navigation noise these laws also fly by the estimates of a Kalman filter
 FILTERED = {f"{name}_filtered": name for name in ("tvlqr_energy", "replan", "replan_measured")}
@@ -409,6 +418,17 @@ def duration(microseconds: float | None) -> str:
 # ---------------------------------------------------------------------------------------------------------------------
 
 
+def in_words(name: str) -> str:
+    """A law's name in a figure."""
+    law = name.removesuffix("_filtered")
+    return IN_WORDS.get(law, law) + (" behind a filter" if law != name else "")
+
+
+def named(by_loss: dict) -> dict:
+    """The groups of `loss_report`, with the laws' names in words."""
+    return {group: {in_words(name): row for name, row in rows.items()} for group, rows in by_loss.items()}
+
+
 def compare(
     env_id: str,
     folder: Path,
@@ -440,7 +460,7 @@ def compare(
     report = comparison.report()
     labelled = {}
     for name, entry in report["laws"].items():
-        label = f"{name}: {entry['dispersed_box_rate']:.1%} of {entry['dispersed_starts']}"
+        label = f"{in_words(name)}: {entry['dispersed_box_rate']:.1%} of {entry['dispersed_starts']}"
         arrays = comparison.arrays[name]
         labelled[label] = chosen(arrays, healthy(arrays))
 
@@ -452,7 +472,7 @@ def compare(
     flown = f"{title}, healthy flights" if failure else title
     figures = {"opponents.png": dispersed_figure(comparison.rocket, labelled, flown)}
     if failure:
-        figures[f"{stem}_by_loss.png"] = losses_figure(report["by_loss"], f"{title}, {WHEN[failure_time]}")
+        figures[f"{stem}_by_loss.png"] = losses_figure(named(report["by_loss"]), f"{title}, {WHEN[failure_time]}")
         arrays = {key: values.astype(np.float32) for key, values in comparison.flights_by_loss().items()}
         write_npz(folder / f"{stem}.npz", arrays)
     write_json(folder / f"{stem}.json", report)

@@ -10,7 +10,6 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Rectangle
 
 from drawing.style import BOUNDARY, OPTIMUM, POLICY, TARGET, TARGET_ORBIT, in_tonnes
-from rocket.losses import STANDARD
 from rocket.metrics import BOX, altitude_km, apsides, element_misses, wilson
 from rocket.missions import Mission
 from rocket.orbits import final_elements, local_frame, orbit_vectors, target_axes, target_orbit
@@ -248,7 +247,7 @@ def targets_figure(rocket: Rocket, arrays: dict, title: str) -> Figure:
 
 
 def losses_figure(report: dict, title: str) -> Figure:
-    """The share saved of the savable flights over the share of thrust lost, and kilograms beside the standard law.
+    """The share saved of the savable flights over the share of thrust lost, and kilograms beside `losses.STANDARD`.
 
     report is that of `losses.loss_report`. A group of flights is at the middle of its losses. Bars are 95 % intervals,
     by Wilson for a share, and paired for a difference. The group above `LARGE` is left out, because its flights are
@@ -279,7 +278,7 @@ def losses_figure(report: dict, title: str) -> Figure:
             )
             kilograms.errorbar(x, mean, [mean - low, high - mean], **style)
     share.set(ylabel="saved of the savable (%)")
-    kilograms.set(ylabel=f"kg more than {STANDARD}, where both saved")
+    kilograms.set(ylabel="kg more than replanning, acceleration measured")
     for ax in figure.axes:
         ax.set(xlabel="share of thrust lost (%)")
         ax.grid(alpha=0.3)

@@ -646,8 +646,6 @@ def test_an_x_max_that_is_too_small_is_said(new_problem, capsys):
     said = capsys.readouterr().err
     line = "^Wide-v0: the state x1 reaches 1.[7-9].*, beyond its x_max of 1.6, which must be larger"
     assert re.search(line, said, re.M)
-        "^Wide-v0: the state x1 reaches 1.[7-9].*, beyond its x_max of 1.6, which must be larger", said, re.M
-    )
 
 
 def test_an_id_that_is_taken_is_refused():
