@@ -20,7 +20,7 @@ def linearise(problem: Problem, point=None, phase: Phase | None = None):
     point = np.zeros(n) if point is None else np.asarray(point, dtype=float)
     h = 2.0**-9
     changes = np.hstack([k * h * np.eye(n + m) for k in (-2, -1, 1, 2)])  # (n + m, 4 (n + m)), a change a column
-    p = tuple(value[:1] for value in problem.hidden(np.zeros((1, problem.scores))))
+    p = tuple(value[:1] for value in problem.hidden(np.zeros((1, problem.drawn))))
     x = tuple(point[:, None] + changes[:n])
     after, *_ = problem.advance(phase or problem.phases[0], x, problem.as_control(changes[n:]), p, problem.dt)
     far_below, below, above, far_above = np.split(np.array(after), 4, axis=1)
@@ -47,7 +47,7 @@ def riccati(problem: Problem):
     for phase in reversed(problem.phases):
         target = problem.aim_of(phase)
         A, B = linearise(problem, target, phase)
-        hidden = problem.hidden(np.zeros((1, problem.scores)))
+        hidden = problem.hidden(np.zeros((1, problem.drawn)))
         free = problem.as_control(np.zeros((m, 1)))
         rest, *_ = problem.advance(phase, tuple(target[:, None]), free, hidden, problem.dt)
         drift = np.array(rest)[:, 0] - target
