@@ -194,9 +194,9 @@ def constants(env_id):
 
 
 def miss_constants(env_id):
-    """The buffers of `to_make_up`: for a problem of your own with one phase that should end in a circle, else none."""
+    """The buffers of `to_make_up`: for a problem of impulses with one phase that should end in a circle, else none."""
     problem = PROBLEMS.get(env_id)
-    if env_id in RECIPES or not problem or problem.waypoints or problem.has_events or not problem.circles_count:
+    if problem is None or problem.step is None or problem.waypoints or not problem.circles_count:
         return {}
     target, Phi, c, push = free_ends(problem)
     gain = -np.linalg.pinv(push) / problem.u_unit[:, None]
