@@ -122,7 +122,7 @@ def optimise(
     """
     problem = PROBLEMS[env_id]
     x0 = np.asarray(x0, dtype=np.float64)
-    draw = np.zeros((len(x0), problem.scores)) if draw is None else np.asarray(draw, dtype=np.float64)
+    draw = np.zeros((len(x0), problem.drawn)) if draw is None else np.asarray(draw, dtype=np.float64)
     _, first, of_start = np.unique(np.hstack([x0, draw]), axis=0, return_index=True, return_inverse=True)
     order = np.argsort(first)  # in the order of the starts, so that an error names the first one
     rank = np.argsort(order)
@@ -394,7 +394,7 @@ def compare(env_id: str, x0, flight: dict, draw) -> dict:
     problem = PROBLEMS[env_id]
     if env_id == DOUBLE_INTEGRATOR.env_id:
         return compare_double_integrator(env_id, x0, flight)
-    more = [problem.has_events, problem.scores, problem.bounds, problem.constraints, problem.step]
+    more = [problem.has_events, problem.drawn, problem.bounds, problem.constraints, problem.step]
     if not problem.weighted or any(more):
         return compare_finer(env_id, x0, flight, draw)
     if problem.circles_count:
@@ -417,6 +417,12 @@ def kept_reference(env_id: str, problem: Problem, eval_seed: int, n: int) -> dic
     return reference(env_id, x0, draw=draw)
 
 
+@lru_cache(maxsize=4)
+def kept_nominal(env_id: str, problem: Problem) -> dict:
+    """`reference` of the one flight from the middle of the starts whose steps draw nothing."""
+    return reference(env_id, np.zeros((1, problem.states)) if problem.x0 is None else np.array([problem.x0]))
+
+
 def report(env_id: str, n: int, seed: int) -> tuple[dict, dict]:
     """Solve the n flights of a seed, and print the optimum and its comparison. Returns the numbers and arrays."""
     problem = PROBLEMS[env_id]
@@ -435,7 +441,7 @@ def report(env_id: str, n: int, seed: int) -> tuple[dict, dict]:
 
 def problem_task(env_id: str) -> PhasedTask:
     """The task of a small problem's id, for `common.tasks.task_of`."""
-    return PhasedTask(env_id, PROBLEMS[env_id], kept_reference, report)
+    return PhasedTask(env_id, PROBLEMS[env_id], kept_reference, kept_nominal, report)
 
 
 # ---------------------------------------------------------------------------------------------------------------------

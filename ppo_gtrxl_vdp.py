@@ -39,6 +39,7 @@ from common import flags
 from common.schedule import Schedule
 from cuda_graphs import speed_up
 from envs import PROBLEMS, own_ids
+from phased.lqr import free_ends
 
 
 @dataclass
@@ -189,12 +190,36 @@ STATE = slice(None)  # what tells the returns of one start's flights apart: all 
 
 def constants(env_id):
     """The buffers of an environment's agents, saved with the weights; `features` reads them as agent.<name>."""
-    return {"observation_scale": runs.observation_scale(env_id)}
+    return {"observation_scale": runs.observation_scale(env_id), **miss_constants(env_id)}
+
+
+def miss_constants(env_id):
+    """The buffers of `to_make_up`: for a problem of impulses with one phase that should end in a circle, else none."""
+    problem = PROBLEMS.get(env_id)
+    if problem is None or problem.step is None or problem.waypoints or not problem.circles_count:
+        return {}
+    target, Phi, c, push = free_ends(problem)
+    gain = -np.linalg.pinv(push) / problem.u_unit[:, None]
+    buffers = {"target": target, "make_up": gain @ Phi, "drift": (gain @ c[..., None])[..., 0]}
+    return {name: value.tolist() for name, value in buffers.items()}
+
+
+def to_make_up(agent, obs):
+    """The constant control (..., actions) that would bring the flight to its target, in units of an action. Ours.
+
+    By the dynamics linearised about the target: the zero-effort miss of guidance over what a control still does. It
+    hardly depends on how far the end is, while the distance that matters falls from the way to the circle.
+    """
+    n = len(agent.target)
+    step = (obs[..., n] * (len(agent.make_up) - 1)).round().long()
+    distance = obs[..., :n] - agent.target
+    return (agent.make_up[step] @ distance[..., None])[..., 0] + agent.drift[step]
 
 
 def features(agent, obs):
-    """What the encoder sees of observations (..., obs): the observations in units of their scale."""
-    return obs / agent.observation_scale
+    """What the encoder sees of observations (..., obs): in units of their scale, and what is `to_make_up` if known."""
+    seen = obs / agent.observation_scale
+    return torch.cat([seen, to_make_up(agent, obs).asinh()], dim=-1) if hasattr(agent, "make_up") else seen
 
 
 def mean_action(output, action_scale):

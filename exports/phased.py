@@ -79,7 +79,7 @@ def flight_columns(task: PhasedTask, arrays: dict, metrics: dict) -> dict[str, n
     names = state_names(problem)
     columns = {"flight": np.arange(len(x))}
     if "draw" in arrays:
-        columns |= named(numbered("score", problem.scores), arrays["draw"])
+        columns |= named(numbered("score", problem.scores), arrays["draw"][:, : problem.scores])
     columns |= named([f"{name}_start" for name in names], x[:, 0])
     columns |= named([f"{name}_end" for name in names], last_living(x))
     if "final_time" in arrays:

@@ -81,6 +81,9 @@ def check_numbers(problem):
     check_norm(problem)
     whole(problem, "substeps", problem.substeps, 1)
     whole(problem, "scores", problem.scores, 0)
+    noise = problem.noise
+    refuse(problem, is_tuple_of(positive, noise), "noise", noise, "must be a tuple of positive numbers")
+    refuse(problem, not noise or problem.step is not None, "noise", noise, "needs step(x, u, w)")
     refuse(problem, positive(problem.dt), "dt", problem.dt, "must be a positive number of seconds")
     if problem.u_scale is not None:
         refuse(problem, positive(problem.u_scale), "u_scale", problem.u_scale, "must be a positive number")
@@ -185,15 +188,16 @@ def check_phase(problem, phase, k: int):
 def try_functions(problem):
     """Call the table's functions at a few points. Refuse wrong sizes, NaN, and what arrays or CasADi cannot take."""
     rng = np.random.default_rng(0)
-    draw = problem.draw_scores(rng, TRIALS)
+    draw = problem.draws(rng, TRIALS)
+    scores = tuple(read_only(column) for column in problem.scores_of(draw))
     p = ()
     if problem.parameters is not None:
         refuse(problem, problem.scores > 0, "scores", problem.scores, "must be at least 1 where parameters are drawn")
-        p = attempt(problem, "parameters", problem.parameters, tuple(read_only(draw.T)))
+        p = attempt(problem, "parameters", problem.parameters, scores)
         refuse(problem, isinstance(p, tuple), "what parameters returns", p, "must be a tuple")
         p = as_rows(problem, "parameters", p)
     if callable(problem.x0):
-        x = attempt(problem, "x0", problem.x0, tuple(read_only(draw.T)))
+        x = attempt(problem, "x0", problem.x0, scores)
         check_size(problem, "x0", x, problem.states)
         x = np.array(as_rows(problem, "x0", x))
     else:
@@ -210,7 +214,8 @@ def try_functions(problem):
     for k, phase in enumerate(problem.phases, start=1):
         name = "step" if problem.f is None else "f" if phase.f is None else f"f of phase {k}"
         dynamics: Any = problem.step or phase.f or problem.f
-        check_tuple(problem, name, dynamics, (x, u), p, problem.states)
+        w = [problem.noise_of(draw, np.zeros(TRIALS, dtype=int))] if problem.noise else []
+        check_tuple(problem, name, dynamics, (x, u, *w), p, problem.states)
         if phase.conditions is not None:
             field = f"conditions of phase {k}"
             count = check_tuple(problem, field, phase.conditions, (x,), p, None)

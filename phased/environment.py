@@ -58,13 +58,14 @@ class PhasedVectorEnv(BatchedEnv):
       conditions count in it
     - with events `final_time` (N,) in s, and `arrived` (N,): whether every phase with an `end` ended by it
     - with constraints `constraint_max` (N,): the largest value of any of them on the way
-    - with scores `draw` (N, k)
+    - with scores or noise `draw` (N, `Problem.drawn`)
 
     `observe_phase=False` shows tau and phi as 0, and `observe_velocity=False` the velocities. `observe_draw` adds the
     standard scores to the observation. With `scaled_action`, which our scripts use, an action of 0 is the middle of the
     set of controls, and an action of 1 is `Problem.u_unit` more.
 
-    `reset(options={"x0": x})` sets the starts x (N, n), and `{"draw": z}` the scores z (N, k). `{"training": {...}}`
+    `reset(options={"x0": x})` sets the starts x (N, n), and `{"draw": z}` the scores and the numbers of every
+    step z (N, `Problem.drawn`). `{"training": {...}}`
     hands over fields of `PhasedTraining`. Raises BadInput for anything else.
     """
 
@@ -101,7 +102,7 @@ class PhasedVectorEnv(BatchedEnv):
         # the last applied control: (N,), or (N, m) if the table has a tuple of controls
         self.u = np.zeros((num_envs, problem.controls) if isinstance(problem.u_max, tuple) else num_envs)
         self.time = np.zeros(num_envs)  # s
-        self.draw = np.zeros((num_envs, problem.scores))
+        self.draw = np.zeros((num_envs, problem.drawn))
         self._parameters = problem.hidden(self.draw)
         self._phase = np.zeros(num_envs, dtype=np.int64)
         self._step_in_phase = np.zeros(num_envs, dtype=np.int64)
@@ -157,7 +158,7 @@ class PhasedVectorEnv(BatchedEnv):
         prices = [problem.bound_price, problem.constraint_price]
         x = tuple(problem.scale[:, None])
         u = problem.as_control(problem.u_unit[:, None])
-        p = problem.hidden(np.zeros((1, problem.scores)))
+        p = problem.hidden(np.zeros((1, problem.drawn)))
         values = [*problem.constraints_at(x, u, p)]
         for phase in problem.phases:
             values += problem.misses(phase, x, p)
@@ -190,16 +191,16 @@ class PhasedVectorEnv(BatchedEnv):
 
     def _start(self, mask, options):
         problem, count = self.problem, int(mask.sum())
-        self.refuse_options(options, ["x0", "draw"] if problem.scores else ["x0"])
+        self.refuse_options(options, ["x0", "draw"] if problem.drawn else ["x0"])
         draw = self.draw[mask]
-        if problem.scores:
-            draw = self._draw_starts(lambda n: problem.draw_scores(self.np_random, n), count)
+        if problem.drawn:
+            draw = self._draw_starts(lambda n: problem.draws(self.np_random, n), count)
         if "draw" in options:
-            draw = self.rows_of(options, "draw", problem.scores)[mask]
+            draw = self.rows_of(options, "draw", problem.drawn)[mask]
         if "x0" in options:
             x0 = self.rows_of(options, "x0", problem.states)[mask]
         elif callable(problem.x0):
-            x0 = np.column_stack([np.broadcast_to(x, count) for x in problem.x0(tuple(draw.T))])
+            x0 = np.column_stack([np.broadcast_to(x, count) for x in problem.x0(problem.scores_of(draw))])
         else:
             x0 = self._draw_starts(lambda n: problem.starts_in_box(self.np_random, n), count)
         for component, start in zip(self.x, x0.T):
@@ -229,7 +230,7 @@ class PhasedVectorEnv(BatchedEnv):
         if problem.waypoints:
             columns.append(phase / (len(problem.phases) - 1) * self.observe_phase)
         if self.observe_draw:
-            columns.append(self.draw)
+            columns.append(self.draw[:, : problem.scores])
         return np.column_stack(columns)
 
     def _applied(self, actions):
@@ -290,11 +291,15 @@ class PhasedVectorEnv(BatchedEnv):
             "it must be finite: the dynamics diverge"
         )
 
+    def _noise(self):
+        """The numbers w that this step draws, a tuple of arrays (N,)."""
+        return self.problem.noise_of(self.draw, np.minimum(self.t, self.problem.steps - 1))
+
     def _fly(self, x, u, phase, h):
         """What `flown` returns, by the phase of each environment."""
         problem, phases = self.problem, self.problem.phases
         if self._alike or (phase == phase[0]).all():
-            return flown(problem, phases[phase[0]], x, u, self._parameters, h)
+            return flown(problem, phases[phase[0]], x, u, self._parameters, h, self._noise())
         after = np.empty((problem.states, self.num_envs))
         cost, excess, worst = np.zeros((3, self.num_envs))
         for k in np.unique(phase):
@@ -329,11 +334,11 @@ class PhasedVectorEnv(BatchedEnv):
     def _view(self, there, phase: Phase, before, u):
         """For the environments `there`, a mask or indices: f(x), states at the begin, event(x), fly(h) by `flown`."""
         problem = self.problem
-        x, p = (tuple(value[there] for value in values) for values in (before, self._parameters))
+        x, p, w = (tuple(value[there] for value in values) for values in (before, self._parameters, self._noise()))
         u = tuple(value[there] for value in u) if isinstance(u, tuple) else u[there]
         f = problem.with_parameters(phase.f or problem.f, p)
         event = problem.with_parameters(phase.end, p)
-        return lambda x: f(x, u), x, event, lambda h: flown(problem, phase, x, u, p, h)
+        return lambda x: f(x, u), x, event, lambda h: flown(problem, phase, x, u, p, h, w)
 
     def _dip(self, there, phase: Phase, before, u, begin, end):
         """The times (n,) in s at which the event is least in this step, and its values there.
@@ -412,7 +417,7 @@ class PhasedVectorEnv(BatchedEnv):
         if self._has_events:
             info["final_time"] = self.time.copy()
             info["arrived"] = self._arrived.copy()
-        if self.problem.scores:
+        if self.problem.drawn:
             info["draw"] = self.draw.copy()
         return info
 
@@ -427,9 +432,9 @@ class PhasedVectorEnv(BatchedEnv):
         return sheet_of(self.problem)
 
 
-def flown(problem: Problem, phase: Phase, x, u, p, h) -> tuple:
+def flown(problem: Problem, phase: Phase, x, u, p, h, w=()) -> tuple:
     """(x, running, excess, worst) of a step of h seconds: `Problem.advance` and `Problem.violation`."""
-    after, running, points = problem.advance(phase, x, u, p, h)
+    after, running, points = problem.advance(phase, x, u, p, h, w)
     return after, running, *problem.violation(x, points, u, p, h)
 
 
@@ -472,7 +477,8 @@ def make_phased(env_id: str, **options) -> PhasedEnv:
 def fly(env_id: str, policy: Callable, x0, draw=None, **options) -> dict:
     """Fly `policy(obs (n, obs), t) -> action (n, m)` from each start x0 (n, states), and record the flights.
 
-    draw (n, k) are the standard scores, if the table has any; all 0 unless given.
+    draw (n, `Problem.drawn`) are the standard scores and the numbers of every step, if the table has any; all 0 unless
+    given.
 
     Returns x (n, T+1, states), the applied (clipped) u (n, T), or (n, T, m) if the table has a tuple of controls,
     reward (n, T), and the arrays of `final_info`. After an episode's end x and u are NaN, and rewards are 0.
@@ -484,8 +490,8 @@ def fly(env_id: str, policy: Callable, x0, draw=None, **options) -> dict:
     u = np.full((T, *batch.u.shape), np.nan)
     reward = np.zeros((n, T))
     options = {"x0": x0}
-    if problem.scores:
-        options["draw"] = np.zeros((n, problem.scores)) if draw is None else draw
+    if problem.drawn:
+        options["draw"] = np.zeros((n, problem.drawn)) if draw is None else draw
     obs, _ = batch.reset(options=options)
     x[:, 0] = np.column_stack(batch.x)  # not from obs, where the velocity may be hidden
 

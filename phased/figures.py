@@ -81,7 +81,7 @@ def time_figure(problem: Problem, arrays: dict, title: str) -> Figure:
 
 def plot_constraints(problem: Problem, arrays: dict, ax):
     """Plot the largest constraint at both ends of each step, or where a discrete step begins. It must not exceed 0."""
-    draw = arrays.get("draw", np.zeros((len(arrays["x"]), problem.scores)))[:SHOWN]
+    draw = arrays.get("draw", np.zeros((len(arrays["x"]), problem.drawn)))[:SHOWN]
     p = tuple(value[:, None, None] for value in problem.hidden(draw))
     t = arrays["t"]
     sides = 2 if problem.step is None else 1

@@ -20,12 +20,42 @@ def linearise(problem: Problem, point=None, phase: Phase | None = None):
     point = np.zeros(n) if point is None else np.asarray(point, dtype=float)
     h = 2.0**-9
     changes = np.hstack([k * h * np.eye(n + m) for k in (-2, -1, 1, 2)])  # (n + m, 4 (n + m)), a change a column
-    p = tuple(value[:1] for value in problem.hidden(np.zeros((1, problem.scores))))
+    p = tuple(value[:1] for value in problem.hidden(np.zeros((1, problem.drawn))))
     x = tuple(point[:, None] + changes[:n])
     after, *_ = problem.advance(phase or problem.phases[0], x, problem.as_control(changes[n:]), p, problem.dt)
     far_below, below, above, far_above = np.split(np.array(after), 4, axis=1)
     AB = (8 * (above - below) - (far_above - far_below)) / (12 * h)
     return AB[:, :n], AB[:, n:]
+
+
+def drift_at(problem: Problem, phase: Phase) -> np.ndarray:
+    """What a step without control changes (n,) at a phase's target, which need not be at rest."""
+    target = problem.aim_of(phase)
+    hidden = problem.hidden(np.zeros((1, problem.drawn)))
+    rest, *_ = problem.advance(
+        phase, tuple(target[:, None]), problem.as_control(np.zeros((problem.controls, 1))), hidden, problem.dt
+    )
+    return np.array(rest)[:, 0] - target
+
+
+def free_ends(problem: Problem):
+    """Where a flight of one phase ends without control, and what a control does, by dynamics linearised at its target.
+
+    The numbers that have a target are n' of n. From the state x at step t they miss it by Phi_t (x - x*) + c_t, the
+    zero-effort miss of guidance, and a control u held from there on adds G_t u. Returns the target x* (n,), Phi
+    (T+1, n', n), c (T+1, n') and G (T+1, n', m).
+    """
+    (phase,) = problem.phases
+    target = problem.aim_of(phase)
+    A, B = linearise(problem, target, phase)
+    drift = drift_at(problem, phase)
+    Phi, c, G = [np.eye(len(A))], [0 * drift], [0 * B]
+    for _ in range(phase.steps):
+        c.append(Phi[-1] @ drift + c[-1])
+        G.append(Phi[-1] @ B + G[-1])
+        Phi.append(Phi[-1] @ A)
+    aims = [k for k, value in enumerate(problem.targets_of(phase)) if value is not None]
+    return target, *(np.array(rows[::-1])[:, aims] for rows in (Phi, c, G))
 
 
 def riccati(problem: Problem):
@@ -47,10 +77,7 @@ def riccati(problem: Problem):
     for phase in reversed(problem.phases):
         target = problem.aim_of(phase)
         A, B = linearise(problem, target, phase)
-        hidden = problem.hidden(np.zeros((1, problem.scores)))
-        free = problem.as_control(np.zeros((m, 1)))
-        rest, *_ = problem.advance(phase, tuple(target[:, None]), free, hidden, problem.dt)
-        drift = np.array(rest)[:, 0] - target
+        drift = drift_at(problem, phase)
         p = p + P[end] @ (target - next_target)  # d is now the distance to this phase's target
         aimed = [value is not None for value in problem.targets_of(phase)]
         P[end] += phase.Qf * np.diag(np.array(aimed, dtype=float))

@@ -72,7 +72,7 @@ def comparable(problem: Problem, arrays: dict) -> np.ndarray:
     """
     n = len(arrays["x"])
     compared = np.ones(n, dtype=bool)
-    p = problem.hidden(arrays.get("draw", np.zeros((n, problem.scores))))
+    p = problem.hidden(arrays.get("draw", np.zeros((n, problem.drawn))))
     for suffix in ("", "_reference"):
         if problem.circles_count:
             compared &= hits_every_circle(problem, arrays[f"x{suffix}"], p)

@@ -51,16 +51,16 @@ class PhaseMesh(NamedTuple):
         return PhaseMesh(tuple(count * factor for count in self.counts), True, factor)
 
 
-def shooting(problem: Problem, phase: Phase, x, u, p, h, x_next):
+def shooting(problem: Problem, phase: Phase, x, u, p, h, x_next, w=()):
     """Defect of multiple shooting, x_{k+1} - step(x_k, u_k) with the environment's step, the running cost, and the
     states after the step's beginning at which constraints hold.
     """
-    after, running, points = problem.advance(phase, x, u, p, h)
+    after, running, points = problem.advance(phase, x, u, p, h, w)
     ends = [*points[:-1], x_next] if points else []
     return tuple(b - a for a, b in zip(after, x_next)), running, ends
 
 
-def hermite_simpson(problem: Problem, phase: Phase, x, u, p, h, x_next):
+def hermite_simpson(problem: Problem, phase: Phase, x, u, p, h, x_next, w=()):
     """Defect of direct collocation, the running cost by Simpson's rule, and the states at which constraints hold after
     the step's beginning.
 
@@ -83,7 +83,7 @@ def program(problem: Problem, mesh: PhaseMesh, defect: Callable, in_circles: boo
     """The nonlinear program as CasADi symbols, and the bounds of its constraints: (symbols, lbg, ubg).
 
     - unknowns: the controls u_0..u_{T-1}, m each, the states x_1..x_T, n each, and the lengths h of `PhaseMesh`
-    - parameters: x_0 and the hidden parameters
+    - parameters: x_0, the hidden parameters, and the numbers w of every step
     - cost: J of `phased/environment.py`, which is the paper's "J" as a sum over steps
     - constraints: the defects (n T of them, = 0); with `in_circles` the sum of (dx / r)^2 at each phase's end (<= 1);
       for a phase with an event its value at the end (= 0) and before (>= 0); the square of a bounded norm; the table's
@@ -93,9 +93,10 @@ def program(problem: Problem, mesh: PhaseMesh, defect: Callable, in_circles: boo
 
     ca.GlobalOptions.setNumpyMode(1)  # np.sin of a symbol is a symbol; without this CasADi warns
     n, m, T = problem.states, problem.controls, sum(mesh.counts)
-    hidden = len(problem.hidden(np.zeros((1, problem.scores))))
+    hidden = len(problem.hidden(np.zeros((1, problem.drawn))))
     x0 = ca.SX.sym("x0", n)
     p = ca.SX.sym("p", hidden)
+    w = ca.SX.sym("w", len(problem.noise), T)
     u = ca.SX.sym("u", m, T)
     x = ca.SX.sym("x", n, T)
     h = ca.SX.sym("h", sum(phase.end is not None for phase in problem.phases))
@@ -118,7 +119,9 @@ def program(problem: Problem, mesh: PhaseMesh, defect: Callable, in_circles: boo
             cost += share * sum(q * (xi - target) ** 2 for q, xi, target in aims if target is not None)
             cost += share * sum(r * ui**2 for r, ui in zip(problem.control_weights(phase), controls))
             control = problem.as_control(controls)
-            gaps, running, points = defect(problem, phase, state, control, parameters, seconds, state_next)
+            gaps, running, points = defect(
+                problem, phase, state, control, parameters, seconds, state_next, ca.vertsplit(w[:, t])
+            )
             cost += running
             defects += gaps
             if phase.end is not None:
@@ -149,7 +152,7 @@ def program(problem: Problem, mesh: PhaseMesh, defect: Callable, in_circles: boo
     high = [0.0] * len(defects) + [1.0] * len(circles)
     high += [0.0 if is_last else np.inf for _, is_last in events] + [greatest**2] * len(norms)
     high += [0.0] * len(constraints)
-    symbols = {"x": ca.vertcat(ca.vec(u), ca.vec(x), h), "p": ca.vertcat(x0, p), "f": cost, "g": g}
+    symbols = {"x": ca.vertcat(ca.vec(u), ca.vec(x), h), "p": ca.vertcat(x0, p, ca.vec(w)), "f": cost, "g": g}
     return symbols, np.array(low), np.array(high)
 
 
@@ -438,7 +441,8 @@ def solve_on(problem: Problem, mesh: PhaseMesh, job: StartJob, sketches: list[Sk
     if aim:
         arguments = aimed(problem, mesh, job, sketches, aim)
     p = [float(value[0]) for value in problem.hidden(job.draw[None])]
-    found = solve(p=np.concatenate([job.x0, p]), x0=placed(problem, mesh, sketches), **arguments)
+    w = job.draw[problem.scores :]
+    found = solve(p=np.concatenate([job.x0, p, w]), x0=placed(problem, mesh, sketches), **arguments)
     begin = problem.states * sum(mesh.counts)
     circles = sum(phase.has_circle for phase in problem.phases) if job.in_circles else 0
     multipliers = found["lam_g"].full()[begin : begin + circles, 0]

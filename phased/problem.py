@@ -88,7 +88,8 @@ class Problem:
     `x0` may then be a function of z, a tuple of k arrays, and `parameters(z)` gives the hidden parameters p.
 
     The dynamics are x' = `f`(x, u), or x_next = `step`(x, u), such as impulses and closed forms. With `step` a phase
-    has no event, and `running` is a sum over the steps.
+    has no event, and `running` is a sum over the steps. With `noise` `step`(x, u, w) also takes a tuple w of numbers
+    that each step draws anew, uniform within +-`noise`. The optimum knows them all.
 
     `bounds` are constraints in the optimum. The environment charges `bound_price` for each second at a distance of one
     `x_scale` beyond them. `constraints`(x, u) are numbers that must not be above 0 at the beginning of a step and at
@@ -127,6 +128,7 @@ class Problem:
     step: Callable | None = None  # x_next = step(x, u), a tuple of n states, instead of f
     constraints: Callable | None = None  # a tuple of numbers of (x, u), each to be at most 0
     constraint_price: float = 0.0
+    noise: tuple[float, ...] = ()  # half widths of the numbers w that each step draws
 
     def __post_init__(self):
         lists_to_tuples(self)
@@ -168,9 +170,14 @@ class Problem:
         return any(phase.end is not None for phase in self.phases)
 
     @property
+    def drawn(self) -> int:
+        """How many numbers an episode draws beside its start: the standard scores, then those of every step."""
+        return self.scores + self.steps * len(self.noise)
+
+    @property
     def has_one_flight(self) -> bool:
         """Whether all episodes have the same start."""
-        return not self.scores and not np.any(self.x0_max)
+        return not self.drawn and not np.any(self.x0_max)
 
     @property
     def circles_count(self) -> bool:
@@ -282,16 +289,17 @@ class Problem:
             return function
         return lambda *arguments: function(*arguments, p)
 
-    def advance(self, phase: Phase, x, u, p, h) -> tuple:
+    def advance(self, phase: Phase, x, u, p, h, w=()) -> tuple:
         """(x_next, cost, points): the states after h seconds, the cost `running` until then, and what lies between.
 
         The cost is an integral, or 0 without `running`. `points` are the states after each Runge-Kutta step; the last
         ones are x_next. With `step` there are none. x is a tuple of n arrays or symbols, u is one of them or a tuple,
-        and p has the hidden parameters.
+        p has the hidden parameters, and w the step's own numbers, 0 unless given.
         """
         running = None if phase.running is None else self.with_parameters(phase.running, p)
         if self.step is not None:
-            after = self.with_parameters(self.step, p)(x, u)
+            noise = [w or (0.0,) * len(self.noise)] if self.noise else []
+            after = self.with_parameters(self.step, p)(x, u, *noise)
             return after, 0.0 if running is None else running(x, u), []
         f = self.with_parameters(phase.f or self.f, p)
         h = h / self.substeps if self.substeps > 1 else h
@@ -340,15 +348,28 @@ class Problem:
         half = np.broadcast_to(np.asarray(self.x0_max, dtype=float), self.states)
         return rng.uniform(centre - half, centre + half, (n, self.states))
 
-    def draw_scores(self, rng: np.random.Generator, n: int) -> np.ndarray:
-        """n draws (n, k) of the standard scores."""
-        return np.clip(rng.standard_normal((n, self.scores)), -LARGEST_SCORE, LARGEST_SCORE)
+    def draws(self, rng: np.random.Generator, n: int) -> np.ndarray:
+        """n draws (n, `drawn`): the standard scores, then w of each step."""
+        scores = np.clip(rng.standard_normal((n, self.scores)), -LARGEST_SCORE, LARGEST_SCORE)
+        if not self.noise:
+            return scores
+        most = np.tile(self.noise, self.steps)
+        return np.hstack([scores, rng.uniform(-most, most, (n, len(most)))])
+
+    def scores_of(self, draw: np.ndarray) -> tuple:
+        """The standard scores of draws (n, `drawn`): a tuple of arrays (n,)."""
+        return tuple(draw[:, : self.scores].T)
 
     def hidden(self, draw: np.ndarray) -> tuple:
-        """The hidden parameters of draws (n, k): a tuple of arrays (n,)."""
+        """The hidden parameters of draws (n, `drawn`): a tuple of arrays (n,)."""
         if self.parameters is None:
             return ()
-        return tuple(np.broadcast_to(value, len(draw)).astype(float) for value in self.parameters(tuple(draw.T)))
+        return tuple(np.broadcast_to(value, len(draw)).astype(float) for value in self.parameters(self.scores_of(draw)))
+
+    def noise_of(self, draw: np.ndarray, t: np.ndarray) -> tuple:
+        """The numbers w of step t (n,) of draws (n, `drawn`): a tuple of arrays (n,)."""
+        first = self.scores + len(self.noise) * t
+        return tuple(draw[np.arange(len(draw)), first + k] for k in range(len(self.noise)))
 
 
 class Tables(dict[str, Problem]):
@@ -393,7 +414,8 @@ def flights_of_seed(problem: Problem, seed: int, n: int) -> tuple[np.ndarray, np
     """The starts (n, states) and draws (n, k) of the n flights of a seed, in evaluations and references."""
     rng = np.random.default_rng(seed)
     if callable(problem.x0):
-        draw = problem.draw_scores(rng, n)
-        return np.column_stack([np.broadcast_to(x, n) for x in problem.x0(tuple(draw.T))]).astype(float), draw
+        draw = problem.draws(rng, n)
+        x0 = problem.x0(problem.scores_of(draw))
+        return np.column_stack([np.broadcast_to(x, n) for x in x0]).astype(float), draw
     x0 = problem.starts_in_box(rng, n)
-    return x0, problem.draw_scores(rng, n)
+    return x0, problem.draws(rng, n)

@@ -96,6 +96,8 @@ def ratio_lines(problem: Problem, metrics: dict) -> list[str]:
     lines.append(f"    ratio of sums {metrics['ratio_of_sums']:.4f}")
     statistics = ", ".join(f"{s} {metrics[f'ratio_{s}']:.4f}" for s in ("min", "median", "max", "p95"))
     lines.append(f"    start by start: {statistics}")
+    if "nominal_ratio" in metrics:
+        lines.append(f"  The flight without scatter costs {metrics['nominal_ratio']:.4f} of its optimum.")
     if "loss_near_origin_mean" in metrics:
         lines[-1] += f"; mean J - J* within {NEAR_ORIGIN} of the origin {metrics['loss_near_origin_mean']:.4f}"
     return lines

@@ -10,7 +10,7 @@ import numpy as np
 from common.command_line import integer
 from common.tasks import SampledTask
 from phased.environment import fly
-from phased.metrics import flight_metrics, near_origin_metrics, ratio_metrics, say_what_is_beyond
+from phased.metrics import cost_ratio, flight_metrics, near_origin_metrics, ratio_metrics, say_what_is_beyond
 from phased.problem import Problem, flights_of_seed
 from phased.table import table
 
@@ -22,6 +22,7 @@ class PhasedTask(SampledTask):
     env_id: str
     problem: Problem
     solve: Callable  # (env_id, problem, eval_seed, n) -> the optimum's flights from the n starts of a seed
+    solve_nominal: Callable  # (env_id, problem) -> the optimum's flight without scatter
     report: Callable  # (env_id, starts, seed) -> the numbers and arrays of the printed optimum
 
     def optimum(self, eval_seed: int, n: int, **env_options) -> dict:
@@ -31,7 +32,7 @@ class PhasedTask(SampledTask):
 
     def reset_options(self, eval_seed: int, n: int, **env_options) -> dict:
         x0, draw = flights_of_seed(self.problem, eval_seed, n)
-        return {"x0": x0, "draw": draw} if self.problem.scores else {"x0": x0}
+        return {"x0": x0, "draw": draw} if self.problem.drawn else {"x0": x0}
 
     def evaluate(self, policy, eval_seed: int, n: int, reference: dict | None = None, **env_options):
         """As `Task.evaluate`. Raises ValueError if the reference belongs to other starts."""
@@ -56,15 +57,25 @@ class PhasedTask(SampledTask):
             metrics["compared_starts"] = int(compared.sum())
         metrics |= ratio_metrics(*costs, eval_seed)
         metrics |= near_origin_metrics(problem, x0[compared], *costs)
+        if problem.noise:
+            metrics |= self.evaluate_nominal(policy, **env_options)
         arrays = {"t": problem.dt * np.arange(problem.steps + 1)}
         arrays |= {key: flight[key] for key in ("x", "u", "reward", "cost")}
         arrays |= {f"{key}_reference": reference[key] for key in ("x", "u", "cost")}
         if problem.has_events:
             for key in ("final_time", "arrived"):
                 arrays |= {key: flight[key], f"{key}_reference": reference[key]}
-        if problem.scores:
+        if problem.drawn:
             arrays["draw"] = draw
         return metrics, arrays
+
+    def evaluate_nominal(self, policy, **env_options) -> dict:
+        """The cost ratio of the flight without scatter, or nothing if it misses a circle."""
+        optimum = self.solve_nominal(self.env_id, self.problem)
+        flight = fly(self.env_id, policy, optimum["x"][:, 0], **env_options)
+        if not flight["hit"].all():
+            return {}
+        return {"nominal_ratio": float(cost_ratio(flight["cost"][0], optimum["cost"][0]))}
 
     # --- the size of an evaluation, and what a run may not do
 

@@ -11,11 +11,14 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 from gymnasium.utils.env_checker import check_env
 from helpers import NETWORK, headline_of
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 from scipy.integrate import solve_ivp
+from scipy.linalg import expm
+from scipy.optimize import linprog
 from scipy.special import erf
 from scipy.stats import norm
 
@@ -36,7 +39,8 @@ from problems.cart_pole import CART_POLE, cart_pole
 from problems.goddard import GODDARD
 
 ROOT = Path(__file__).parent.parent
-OWN = ["BrysonDenham-v0", "CartPoleSwingUp-v0", "Goddard-v0", "PendulumUpright-v0"]  # not the tables of a user
+# not the tables of a user
+OWN = ["BrysonDenham-v0", "CartPoleSwingUp-v0", "Goddard-v0", "PendulumUpright-v0", "Rendezvous-v0"]
 G = 9.80665
 
 
@@ -619,6 +623,9 @@ SLIPS = {
     "neither f nor step": ({"f": None}, "f of Mine-v0 is None; it must be given, or step"),
     "step with substeps": ({"f": None, "step": spring, "substeps": 2}, "substeps"),
     "step with an end": ({"f": None, "step": spring, **phase(end=lambda x: 9 - x[0])}, "end of phase 1"),
+    "noise without a step": ({"noise": (0.1,)}, "noise .* needs step"),
+    "noise 0": ({"f": None, "step": lambda x, u, w: spring(x, u), "noise": (0.0,)}, "noise"),
+    "a step without its noise": ({"f": None, "step": spring, "noise": (0.1,)}, "step of Mine-v0 fails"),
     "constraints without a price": ({"constraints": lambda x, u: (x[0] - 9,)}, "constraint_price"),
     "a constraint alone": ({"constraints": lambda x, u: x[0] - 9, "constraint_price": 1.0}, "constraints .* a tuple"),
     "conditions without a radius": ({"phases": (Phase(5, conditions=lambda x: (x[0],)),)}, "conditions of phase 1"),
@@ -783,6 +790,37 @@ def test_a_running_cost_of_a_step_is_summed(new_problem):
     assert flight["cost"][0] == 2**2 + 3**2 + 4**2 + 5**2
 
 
+PUSHES = {"step": lambda x, u, w: (x[0] + u + w[0],), "noise": (0.5,), "u_max": 9.0, "x_max": (99.0,)}
+
+
+def test_each_step_draws_its_own_noise(new_problem):
+    problem = Problem("Pushed-v0", phases=(Phase(4),), x0_max=0.0, **PUSHES)
+    new_problem(problem)
+    batch = gym.make_vec("Pushed-v0", num_envs=2000)
+    batch.reset(seed=1)
+    x = [batch.x[0]]
+    for _ in range(4):
+        _, _, _, _, info = batch.step(np.zeros((2000, 1)))
+        x.append(batch.x[0])
+    w = np.diff(x[:4], axis=0)
+    np.testing.assert_allclose(w.T, info["final_info"]["draw"][:, :3])
+    assert np.abs(w).max() <= 0.5
+    np.testing.assert_allclose(w.std(axis=1), 0.5 / math.sqrt(3), rtol=0.05)
+    assert np.abs(np.corrcoef(w) - np.eye(3)).max() < 0.1
+
+
+def test_the_optimum_knows_the_noise(new_problem):
+    """The sum of u^2 over T steps and of x^2 at the end is least for equal u = -d / (T + 1), d = x0 + sum of w."""
+    running = Phase(4, running=lambda x, u: u**2, terminal=lambda x: x[0] ** 2)
+    new_problem(Problem("Known-v0", phases=(running,), **PUSHES))
+    x0, draw = flights_of_seed(PROBLEMS["Known-v0"], 0, 3)
+    assert draw.shape == (3, 4)
+    flight = baselines.reference("Known-v0", x0, draw)
+    d = x0[:, 0] + draw.sum(axis=1)
+    np.testing.assert_allclose(flight["u"], np.tile(-d[:, None] / 5, 4), atol=1e-7)
+    np.testing.assert_allclose(flight["cost"], d**2 / 5, atol=1e-9)
+
+
 def test_a_condition_knows_the_hidden_parameters(new_problem):
     """The least integral of u^2 in a second that brings x to within r of p is the square of the way."""
     meet = Phase(10, radius=0.01, bonus=20.0, running=lambda x, u, p: u**2, conditions=lambda x, p: (x[0] - p[0],))
@@ -829,3 +867,75 @@ def test_a_circular_orbit_is_a_condition(new_problem):
     r, radial, v, _ = flight["x"][0, -1]
     assert r == pytest.approx(1.5269, abs=1e-4)
     assert math.hypot(radial, v * math.sqrt(r) - 1) <= 0.001
+
+
+def test_the_control_to_make_up_brings_a_flight_to_its_target():
+    """The rendezvous is linear: held from the fifth impulse on, the control that the policy sees ends at the target."""
+    problem = PROBLEMS["Rendezvous-v0"]
+    batch = gym.make_vec(problem.env_id, num_envs=1).unwrapped
+    agent = script.Agent(script.Args(env_id=problem.env_id, num_blocks=0, embed_dim=8, hidden_dim=8), batch)
+    seen = {}
+
+    def policy(obs, t):
+        to_make_up = script.to_make_up(agent, torch.as_tensor(obs).float()).numpy() * problem.u_unit
+        return seen.setdefault("control", to_make_up) if t >= 5 else 0 * to_make_up
+
+    x0, _ = flights_of_seed(problem, 0, 3)
+    end = fly(problem.env_id, policy, x0)["x"][:, -1]
+    assert np.linalg.norm(end[:, :3] - [0, -1000, 0], axis=1).max() < 0.1  # m; without it they end up to 60 km away
+
+
+def least_velocity_change(x0, w):
+    """(m/s) of a rendezvous in the plane by a linear program, from x0 (4,) and disturbances w (30, 2) in m/s^2.
+
+    Hill's equations are integrated by a matrix exponential. A length is the largest of its projections on 720
+    directions, so the result is low by at most 1e-5.
+    """
+    n, dt, steps = 8.5193e-4, 200.0, 30
+    hill = np.array([[0, 0, 1, 0], [0, 0, 0, 1], [3 * n**2, 0, 0, 2 * n], [0, 0, -2 * n, 0]])
+    phi = expm(hill * dt)
+    free, gain = [np.array(x0)], [np.zeros((4, 2 * steps))]  # the state is free + gain @ u
+    for k in range(steps):
+        pushed = gain[-1].copy()
+        pushed[2:, 2 * k : 2 * k + 2] += np.eye(2)
+        free.append(phi @ (free[-1] + np.array([0, 0, *dt * w[k]])))
+        gain.append(phi @ pushed)
+    angles = np.arange(720) * 2 * np.pi / 720
+    directions = np.column_stack([np.cos(angles), np.sin(angles)])
+    A, b = [], []
+    for k in range(steps + 1):  # the last impulse stops
+        change = np.eye(2 * steps)[2 * k : 2 * k + 2] if k < steps else gain[-1][2:]
+        lengths = np.zeros((720, steps + 1))
+        lengths[:, k] = -1
+        A.append(np.hstack([directions @ change, lengths]))
+        b.append(-directions @ (free[-1][2:] if k == steps else np.zeros(2)))
+    tan = math.tan(math.radians(20))
+    for x, u in zip(free[:-1], gain[:-1]):
+        for side in (1, -1):
+            A.append(np.hstack([side * u[:1] + tan * u[1:2], np.zeros((1, steps + 1))]))
+            b.append([-side * x[0] - tan * x[1]])
+    ends = np.hstack([gain[-1][:2], np.zeros((2, steps + 1))])
+    found = linprog(
+        [0] * 2 * steps + [1] * (steps + 1),
+        A_ub=np.vstack(A),
+        b_ub=np.concatenate(b),
+        A_eq=ends,
+        b_eq=np.array([0, -1000]) - free[-1][:2],
+        bounds=[(None, None)] * 2 * steps + [(0, None)] * (steps + 1),
+    )
+    return found.fun
+
+
+def test_the_rendezvous_is_the_published_one():
+    """4.877 m/s is printed by the authors. A drawn flight is compared with the linear program alone."""
+    problem = PROBLEMS["Rendezvous-v0"]
+    nominal = np.array(problem.x0)
+    x0, draw = flights_of_seed(problem, 3, 1)
+    x0[0, 2] = 0.0
+    draw = draw.reshape(30, 3) * [1, 1, 0]
+    cases = [(nominal, np.zeros((30, 3)), 4.877), (x0[0], draw, None)]
+    for start, w, printed in cases:
+        flight = baselines.reference(problem.env_id, start[None], w.reshape(1, -1))
+        change = 5 * np.linalg.norm(flight["u"][0], axis=1).sum() + np.linalg.norm(flight["x"][0, -1, 3:])
+        assert change == pytest.approx(least_velocity_change(start[[0, 1, 3, 4]], w[:, :2]), rel=2e-4)
+        assert printed is None or change == pytest.approx(printed, abs=5e-4)
