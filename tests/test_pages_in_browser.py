@@ -115,7 +115,8 @@ def test_time_runs_and_views_change(opened):
     page.wait_for_function("() => page.time > 20")
     page.click("#play")
     place = page.evaluate("page.scene.camera.position.toArray()")
-    page.click("text=orbit")
+    page.click("[data-view=orbit]")
+    assert page.get_attribute("[aria-pressed=true]", "data-view") == "orbit"
     assert page.evaluate("page.scene.camera.position.toArray()") != place
     assert float(page.inner_text("#clock").split()[0]) == pytest.approx(page.evaluate("page.time"), abs=0.06)
 
