@@ -64,9 +64,9 @@ class PhasedVectorEnv(BatchedEnv):
     standard scores to the observation. With `scaled_action`, which our scripts use, an action of 0 is the middle of the
     set of controls, and an action of 1 is `Problem.u_unit` more.
 
-    `reset(options={"x0": x})` sets the starts x (N, n), and `{"draw": z}` the scores and the numbers of every
-    step z (N, `Problem.drawn`). `{"training": {...}}`
-    hands over fields of `PhasedTraining`. Raises BadInput for anything else.
+    `reset(options={"x0": x})` sets the starts x (N, n). `{"draw": z}` sets the scores and the numbers of every
+    step, z (N, `Problem.drawn`). `{"training": {...}}` hands over fields of `PhasedTraining`. Raises BadInput for
+    anything else.
     """
 
     metadata = {**BatchedEnv.metadata, **RENDERED}
@@ -293,6 +293,8 @@ class PhasedVectorEnv(BatchedEnv):
 
     def _noise(self):
         """The numbers w that this step draws, a tuple of arrays (N,)."""
+        if not self.problem.noise:
+            return ()
         return self.problem.noise_of(self.draw, np.minimum(self.t, self.problem.steps - 1))
 
     def _fly(self, x, u, phase, h):

@@ -15,7 +15,7 @@ OMEGA = 8.5193e-4  # rad/s, of the target's circular orbit
 DT = 200.0  # s between two impulses
 GREATEST = 5.0  # m/s
 S, C = np.sin(OMEGA * DT), np.cos(OMEGA * DT)
-EDGE = np.tan(np.radians(20.0))  # of the cone
+EDGE = np.tan(np.radians(20.0))  # of the cone, which is a pyramid of four sides about -y
 
 
 def impulse(x, u, w):
@@ -43,10 +43,10 @@ def length(size, *vector):
 RENDEZVOUS = envs.Problem(
     env_id="Rendezvous-v0",
     step=impulse,
-    noise=(1e-5, 1e-5, 5e-7),
+    noise=(1e-5, 1e-5, 5e-7),  # m/s^2
     u_max=(1.0, 1.0, 1.0),
     u_norm=(0.0, 1.0),
-    u_scale=0.06,
+    u_scale=0.06,  # 0.3 m/s
     phases=(
         envs.Phase(
             steps=30,

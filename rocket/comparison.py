@@ -24,7 +24,7 @@ from common.policies import competitors, fly_by_script
 from rocket import guidance
 from rocket.failure import WHEN, check_failure
 from rocket.kalman import Filtered
-from rocket.losses import aligned, loss_lines, loss_report
+from rocket.losses import aligned, in_words, loss_lines, loss_report
 from rocket.metrics import (
     AT_ONCE,
     SUCCESS,
@@ -51,15 +51,6 @@ KNOWLEDGE = {  # what each opponent has to know
     "replan_after_lqr": "nominal exhaust velocity, optimum and its gains + IPOPT on board",
     "replan_hint": "its own exhaust velocity, drawn + IPOPT on board",
     "optimum": "the draw itself",
-}
-IN_WORDS = {  # the names of the laws in figures, where they are not their own words
-    "replay": "open loop",
-    "tvlqr": "LQR",
-    "tvlqr_energy": "LQR by energy",
-    "replan": "replanning",
-    "replan_measured": "replanning, acceleration measured",
-    "replan_after_lqr": "LQR, then replanning",
-    "replan_hint": "replanning with a hint",
 }
 REPLANS = ("replan", "replan_measured", "replan_after_lqr", "replan_hint")
 # with navigation noise these laws also fly by the estimates of a Kalman filter
@@ -418,17 +409,6 @@ def duration(microseconds: float | None) -> str:
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def in_words(name: str) -> str:
-    """A law's name in a figure."""
-    law = name.removesuffix("_filtered")
-    return IN_WORDS.get(law, law) + (" behind a filter" if law != name else "")
-
-
-def named(by_loss: dict) -> dict:
-    """The groups of `loss_report`, with the laws' names in words."""
-    return {group: {in_words(name): row for name, row in rows.items()} for group, rows in by_loss.items()}
-
-
 def compare(
     env_id: str,
     folder: Path,
@@ -472,7 +452,7 @@ def compare(
     flown = f"{title}, healthy flights" if failure else title
     figures = {"opponents.png": dispersed_figure(comparison.rocket, labelled, flown)}
     if failure:
-        figures[f"{stem}_by_loss.png"] = losses_figure(named(report["by_loss"]), f"{title}, {WHEN[failure_time]}")
+        figures[f"{stem}_by_loss.png"] = losses_figure(report["by_loss"], f"{title}, {WHEN[failure_time]}")
         arrays = {key: values.astype(np.float32) for key, values in comparison.flights_by_loss().items()}
         write_npz(folder / f"{stem}.npz", arrays)
     write_json(folder / f"{stem}.json", report)

@@ -10,6 +10,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Rectangle
 
 from drawing.style import BOUNDARY, OPTIMUM, POLICY, TARGET, TARGET_ORBIT, in_tonnes
+from rocket.losses import STANDARD, in_words
 from rocket.metrics import BOX, altitude_km, apsides, element_misses, wilson
 from rocket.missions import Mission
 from rocket.orbits import final_elements, local_frame, orbit_vectors, target_axes, target_orbit
@@ -263,7 +264,14 @@ def losses_figure(report: dict, title: str) -> Figure:
     names = list(report["0"])
     for k, (name, colour) in enumerate(zip(names, itertools.cycle(COLOURS))):
         aside = 0.12 * (k - (len(names) - 1) / 2)  # so that equal points do not hide one another
-        style = {"color": colour, "marker": "o", "markersize": 4, "linewidth": 1.0, "capsize": 2, "label": name}
+        style = {
+            "color": colour,
+            "marker": "o",
+            "markersize": 4,
+            "linewidth": 1.0,
+            "capsize": 2,
+            "label": in_words(name),
+        }
         rows = [(place + aside, report[label][name]) for label, place in places.items()]
         saved = [(x, row["saved"], row["savable"]) for x, row in rows if row["savable"]]
         if saved:
@@ -278,7 +286,7 @@ def losses_figure(report: dict, title: str) -> Figure:
             )
             kilograms.errorbar(x, mean, [mean - low, high - mean], **style)
     share.set(ylabel="saved of the savable (%)")
-    kilograms.set(ylabel="kg more than replanning, acceleration measured")
+    kilograms.set(ylabel=f"kg more than {in_words(STANDARD)},\nwhere both saved")
     for ax in figure.axes:
         ax.set(xlabel="share of thrust lost (%)")
         ax.grid(alpha=0.3)

@@ -18,6 +18,15 @@ from rocket.metrics import SUCCESS
 EDGES = (0.0, 0.05, 0.10, 0.20, 0.25, 0.30)  # shares of thrust lost
 LARGE = 0.15  # share of thrust lost, above which it helps most to know of a failure beforehand
 STANDARD = "replan_measured"  # the law that the others are compared with
+IN_WORDS = {  # the names of the laws in figures, where they are not their own words
+    "replay": "open loop",
+    "tvlqr": "LQR",
+    "tvlqr_energy": "LQR by energy",
+    "replan": "replanning",
+    "replan_measured": "replanning, acceleration measured",
+    "replan_after_lqr": "LQR, then replanning",
+    "replan_hint": "replanning with a hint",
+}
 CONFIDENCE = 0.95
 
 
@@ -42,6 +51,12 @@ class Ends(NamedTuple):
 # ---------------------------------------------------------------------------------------------------------------------
 # Groups of flights
 # ---------------------------------------------------------------------------------------------------------------------
+
+
+def in_words(name: str) -> str:
+    """A law's name in a figure."""
+    law = name.removesuffix("_filtered")
+    return IN_WORDS.get(law, law) + (" behind a filter" if law != name else "")
 
 
 def groups(failure: np.ndarray, largest: float) -> dict[str, np.ndarray]:
