@@ -712,7 +712,7 @@ def linear_fit(x, y, alive):
     So its residual is smaller by the factor 1 - leverage, and an episode in an extreme state counts less. On average
     the leverage is (k + 1) / G, so k should be small. It depends on the states of this step and not on the action. So
     with --gae-lambda 1 the expected policy gradient of a state keeps its direction. Below 1 this holds only
-    approximately. Fits that leave the episode out are worse (docs/archive.md).
+    approximately. Fits that leave the episode out bring nothing.
     """
     x = x.double()
     y = y.double()[..., None]  # (..., G, 1)

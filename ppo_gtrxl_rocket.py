@@ -511,9 +511,8 @@ def past_the_blocks(agent, obs):
     """What is added to the last block's output: (..., d) of observations (..., 9 or more), or 0. Ours.
 
     With --direct-differences it is a linear map of the `differences`, up to FAR. A block has layer norms, and gates
-    that depend on its input. It answers to a difference ten times as large as those of training with up to three times
-    the tenfold answer (docs/archive.md). So the blocks see differences only up to NEAR, and the linear map goes on in
-    proportion.
+    that depend on its input. It answers to differences far beyond those of training with up to three times what is in
+    proportion (docs/archive.md). So the blocks see differences only up to NEAR, and the linear map goes on from there.
     """
     if agent.direct is None:
         return 0.0
@@ -1000,7 +999,7 @@ def linear_fit(x, y, alive):
     So its residual is smaller by the factor 1 - leverage, and an episode in an extreme state counts less. On average
     the leverage is (k + 1) / G, so k should be small. It depends on the states of this step and not on the action. So
     with --gae-lambda 1 the expected policy gradient of a state keeps its direction. Below 1 this holds only
-    approximately. Fits that leave the episode out are worse (docs/archive.md).
+    approximately. Fits that leave the episode out bring nothing.
     """
     x = x.double()
     y = y.double()[..., None]  # (..., G, 1)
