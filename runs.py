@@ -102,7 +102,7 @@ def parse_args(script, argv):
         untyped, saved = resolve(typed, script)
     args = replace(untyped, **typed)
     if asks_for_help:
-        read_flags(args, ["--help"])  # prints, and ends the script
+        read_flags(args, ["--help"], f"--env-id is one of {', '.join(script.ENV_IDS)}.")  # prints, and ends the script
     check(args, script.ENV_IDS)
     task = task_of(args.env_id)
     options = {name: getattr(args, name) for name in script.ENV_OPTIONS}
@@ -121,8 +121,10 @@ def parse_args(script, argv):
     return args, saved
 
 
-def read_flags(defaults, argv):
-    """{field: value} of the flags that a command line names. `defaults` is an Args, whose values --help shows.
+def read_flags(defaults, argv, description=""):
+    """{field: value} of the flags that a command line names. --help shows a description and the values of `defaults`.
+
+    `defaults` is an Args.
 
     tyro knows which flags there are and what they take. It does not tell which flags were typed, so we read their names
     from `argv`. It complains in a frame of several lines, so we show the frame's first paragraph as one line.
@@ -130,9 +132,10 @@ def read_flags(defaults, argv):
     with contextlib.redirect_stderr(io.StringIO()) as frame:
         try:
             with REGISTRY:
-                args = tyro.cli(type(defaults), args=argv, default=defaults, description=allowed(type(defaults)))
+                args = tyro.cli(type(defaults), args=argv, default=defaults, description=description)
         except SystemExit as stop:
             if not stop.code:  # --help
+                print(allowed(type(defaults)))
                 raise
             lines = [line.strip("│ ") for line in frame.getvalue().splitlines() if line[:1] != "╭"]
             first_paragraph = takewhile(lambda line: line[:1] not in ("─", "╰"), lines)
@@ -147,7 +150,7 @@ def allowed(kind):
     flags = {}
     for name, (low, high) in facts(kind, Range).items():
         flags.setdefault(f"{low:g} to {high:g}", []).append(flag_of(name, ""))
-    return "Ranges. " + ". ".join(f"{bounds}: {', '.join(names)}" for bounds, names in flags.items())
+    return "\n".join(["Ranges:", *(f"  {bounds}: {', '.join(names)}" for bounds, names in flags.items())])
 
 
 def resumed(typed, script):
