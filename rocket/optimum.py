@@ -344,8 +344,11 @@ def refuse_too_weak(case: AscentCase):
     speed = delta_v(rocket) + np.linalg.norm(rocket.x0[3:6])
     if speed**2 / 2 - rocket.mu / rocket.Re < rocket.target_energy:
         needs = np.sqrt(2 * (rocket.target_energy + rocket.mu / rocket.Re))
+        *_, (_, _, thrust, flow, _) = (arc for arc in rocket.arcs() if arc[3])
+        missing = rocket.dry_mass * np.expm1((needs - speed) * flow / thrust)
         has = f"delta-v and the Earth's turning are {speed:.0f} m/s, its orbit needs {needs:.0f} m/s and losses"
-        raise NoOptimum(f"rocket ascent {case.key}: {has}; look at its payload, {rocket.payload} kg")
+        lacks = f"at least {missing:.0f} kg of propellant are missing in the last burn"
+        raise NoOptimum(f"rocket ascent {case.key}: {has}: {lacks}; look at its payload, {rocket.payload} kg")
 
 
 def optimise_ascent(case: AscentCase, segments: int = SEGMENTS) -> dict:
