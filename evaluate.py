@@ -62,8 +62,8 @@ def publish(run_dir, folder, ship: bool = False, numbers: bool = False, replace:
     """Add a run to a results folder: its eval.json and training curve under seeds/, and the policy if it is shipped.
 
     The policy, its evaluation and the figures are replaced only if the folder ships no policy, or with `ship`. With
-    `numbers` the folder gets only seeds/, and a curve has only the updates that were evaluated. The folder may keep a
-    part of the flights, but its figures show all.
+    `numbers` the folder gets only seeds/. A curve has only the updates that were evaluated, but for the policy's own.
+    The folder may keep a part of the flights, but its figures show all.
 
     A run of a seed that is there is refused without `replace`. So is a run that does not belong to the folder's others:
     of another problem, with other arguments (but for OWN_ARGUMENTS), or of a problem that has been edited since.
@@ -93,7 +93,7 @@ def publish(run_dir, folder, ship: bool = False, numbers: bool = False, replace:
         (staged / "seeds").mkdir()
         for path in (folder / "seeds").glob("*.csv"):
             write_bytes(staged / "seeds" / path.name, path.read_bytes())
-        write_csv(staged / "seeds" / f"{seed}.csv", evaluated(curve) if numbers else curve)
+        write_csv(staged / "seeds" / f"{seed}.csv", curve if ships else evaluated(curve))
         last = staged / "seeds" / f"{seed}.json"
         write_bytes(last, (run_dir / "eval.json").read_bytes())
         if ships:
