@@ -168,13 +168,22 @@ OWN = {  # a problem of your own; flights are compared from the first update on,
 }
 OWN_WITH_ONE_START = {**OWN, "total_updates": 1400, "num_envs": 64, "flights_per_start": 64}
 OWN_WITH_STARTS = {**OWN, "total_updates": 150, "num_envs": 256, "flights_per_start": 16}
+OWN_WITH_IMPULSES = {  # a few impulses make a short flight, so there can be many; least fuel has impulses of zero
+    **OWN_WITH_STARTS,
+    "total_updates": 1400,
+    "flights_per_start": 32,
+    "gae_lambda": 0.9,
+    "log_std": "0:-0.7 0.15:-1.7 0.85:-4.6 1:-6",
+}
 
 
 def recipe(args):
-    """What our recipe changes for the environments of `args`. A problem of your own takes one of two recipes."""
+    """What our recipe changes for the environments of `args`. A problem of your own takes one of three recipes."""
     if args.env_id in RECIPES:
         return RECIPES[args.env_id]
     problem = PROBLEMS.get(args.env_id)
+    if problem and problem.step:
+        return OWN_WITH_IMPULSES
     if problem and problem.has_one_flight:
         return OWN_WITH_ONE_START
     return OWN_WITH_STARTS

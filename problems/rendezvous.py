@@ -52,7 +52,6 @@ RENDEZVOUS = envs.Problem(
             steps=30,
             target=(0.0, -1000.0, 0.0, None, None, None),
             radius=0.5,
-            bonus=10.0,
             running=lambda x, u: GREATEST * length(2e-5, *u),
             # the last impulse stops the chaser; a metre off costs 0.05 m/s
             terminal=lambda x: length(1e-4, *x[3:]) + 0.05 * length(0.1, x[0], x[1] + 1000, x[2]),
@@ -60,7 +59,7 @@ RENDEZVOUS = envs.Problem(
     ),
     dt=DT,
     constraints=lambda x, u: tuple(side + EDGE * x[1] for side in (x[0], -x[0], x[2], -x[2])),
-    constraint_price=1e-4,
+    constraint_price=2e-4,
     x0=(0.0, -15e3, 0.0, 0.0, 0.0, 0.0),
     x0_max=(1500.0, 1500.0, 75.0, 0.0, 0.0, 0.0),
     x_max=(3e5, 2e6, 3e5, 400.0, 800.0, 400.0),
