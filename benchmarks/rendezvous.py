@@ -15,10 +15,10 @@ from common.command_line import OneLineParser, integer
 from common.tables import lines_of
 from common.tasks import task_of
 from phased.metrics import KEPT
-from phased.problem import PROBLEMS, flights_of_seed
-from problems.rendezvous import GREATEST
+from phased.problem import flights_of_seed
+from problems.rendezvous import GREATEST, RENDEZVOUS
 
-ENV_ID = "Rendezvous-v0"
+ENV_ID = RENDEZVOUS.env_id
 HEAD = ("", "nominal (m/s)", "draws: mean, σ (m/s)", "mean miss (m)", "within 0.5 m", "within 1 m", "cone kept")
 PUBLISHED = (  # AIAA 2021-0668; of 1000 draws
     ("published: convex optimum", "4.877", "-", "-", "-", "-", "-"),
@@ -49,13 +49,12 @@ def main():
     parser.add_argument("--eval-seed", type=integer(0, 2**32 - 1), default=0, metavar="S", help="default 0")
     args = parser.parse_args()
     task = task_of(ENV_ID)
-    problem = PROBLEMS[ENV_ID]
-    x0, draw = flights_of_seed(problem, args.eval_seed, args.draws)
-    best = task.solve_nominal(ENV_ID, problem)
+    x0, draw = flights_of_seed(RENDEZVOUS, args.eval_seed, args.draws)
+    best = task.solve_nominal(ENV_ID, RENDEZVOUS)
     rows = [HEAD, *PUBLISHED, row("optimum", best, task.optimum(args.eval_seed, args.draws))]
     for path in args.policies:
         agent, _, options = load(path)
-        policy = agent.make_policy(problem.steps)
+        policy = agent.make_policy(RENDEZVOUS.steps)
         nominal = envs.fly(ENV_ID, policy, best["x"][:, 0], **options)
         rows.append(row(path, nominal, envs.fly(ENV_ID, policy, x0, draw, **options)))
     print("\n".join(lines_of(rows)))

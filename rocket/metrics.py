@@ -287,9 +287,10 @@ def element_misses(flights: dict, rocket: Rocket) -> dict:
             flown["argp_deg"] = perigee_longitude(flown["raan_deg"], flown["argp_deg"], rocket.i)
     flown |= apsides(flights["a_km"], flights["e"], rocket)
     misses = {key: wrapped(key, flown[key] - target[key]) for key in BOX if key in target}
-    if "target" in flights:
-        misses["argp_deg"] = np.where(flights["target"][:, 1] < NEARLY_A_CIRCLE, 0.0, misses["argp_deg"])
-    return misses
+    if "target" not in flights:
+        return misses
+    has_perigee = flights["target"][:, 1] >= NEARLY_A_CIRCLE
+    return misses | {"argp_deg": has_perigee * misses["argp_deg"]}
 
 
 def box_rate(inside: int, n: int) -> dict:
