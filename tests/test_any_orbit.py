@@ -18,7 +18,7 @@ from envs import ROCKET, ROCKETS, BadInput
 from exports.rocket import interface
 from rocket import guidance, neighbours
 from rocket.any_orbit import refuse_unreachable, solve_target, solve_targets, target_masses
-from rocket.metrics import element_misses, targets_of
+from rocket.metrics import element_misses, inside_box, targets_of
 from rocket.missions import Mission
 from rocket.optimum import AscentCase, optimise_ascent
 from rocket.rewards import mass_rewards
@@ -213,6 +213,14 @@ def test_misses_are_counted_from_each_flight_s_target():
     misses = element_misses(ends, ROCKET)
     np.testing.assert_allclose(misses["perigee_km"], -TARGETS[:, 0] / 1e6)
     np.testing.assert_allclose(misses["argp_deg"], 0.4, rtol=1e-9)
+
+
+def test_a_nearly_circular_target_has_no_perigee_to_miss():
+    """Its perigee may lie anywhere in a launcher's accuracy, that of an ellipse within 0.3 degrees."""
+    target = np.array([[7e6, e, 33.0, 303.0, 100.0] for e in (0.0, 0.009, 0.011)])
+    a, e, i, raan, argp = target.T
+    flown = {"a_km": a / 1e3, "e": e, "i_deg": i, "raan_deg": raan, "argp_deg": argp + 90, "crashed": np.zeros(3, bool)}
+    assert inside_box({**flown, "target": target}, ROCKET).tolist() == [True, True, False]
 
 
 # --- optima and opponents ---------------------------------------------------------------------------------------------
