@@ -8,10 +8,12 @@
     python ppo_gtrxl_rocket.py --seed 1 --recipe paper                  # plain PPO with Table 1
     python ppo_gtrxl_rocket.py --eval-only --checkpoint results/rocket_fixed/agent.safetensors
 
-Reading order: arguments, recipes, problem, Gated Transformer-XL, agent, PPO, what we add to PPO, training, main.
-From the first section "Shared" on, all ppo_gtrxl_*.py are the same but for lines that end with "# this problem". A
-section headed "Problem, ours" or "Shared, ours" contains nothing from the paper. In the other sections a comment marks
-what is ours. "Line 8" means line 8 of Algorithm 1, "Eq. (7)" the seventh numbered equation of the paper.
+Reading order: arguments, recipes, problem, Gated Transformer-XL, agent, PPO, what we add to PPO, training, main. From
+the first section "Shared" on, all ppo_gtrxl_*.py are the same but for lines that end with "# this problem". A section
+headed "Problem, ours" or "Shared, ours" contains nothing from the paper. In the other sections "ours" marks what
+changes the paper's algorithm. Where the paper is silent, docs/decisions.md says what we chose. "Line 8" means line 8 of
+Algorithm 1, "Eq. (7)" the seventh numbered equation of the paper. `runs.py` saves, logs, and flies the
+optimum of `baselines.py` beside each evaluation.
 
 T is the number of steps, N of environments, H of heads. L is the memory length, d the width, and dk = d / H.
 Algorithm 1 writes E for our N, and N for its iterations.
@@ -101,7 +103,7 @@ class Args:
     mlp_dim: flags.Width = 384  # width of the position-wise MLP
     hidden_dim: flags.Width = 384  # width of the hidden layer of each head
     gamma: flags.Share = 0.99  # the discount factor gamma
-    gae_lambda: flags.ShareSchedule = Schedule(0.95)  # the lambda for the general advantage estimation
+    gae_lambda: flags.ShareSchedule = Schedule(0.95)  # lambda of generalized advantage estimation, Eq. (12)
     total_updates: flags.Count = 5000  # number of updates
     update_epochs: flags.Count = 16  # the K epochs to update the policy
     vf_coef: flags.Weight = 0.8  # coefficient of the value function
@@ -576,7 +578,8 @@ def linear(inputs, outputs, gain=1.0, bias=0.0):
 class Gate(nn.Module):
     """Eq. (7): gate(x, y) = lambda x + (1 - lambda) y, lambda = sigmoid(W_g [x, y] + b_g), of x and y (..., d).
 
-    With b_g > 0 an untrained gate is near the identity gate(x, y) = x.
+    With b_g > 0 an untrained gate is near the identity gate(x, y) = x. It is the highway gate of Parisotto et al.
+    (2020), not their GRU gate.
     """
 
     def __init__(self, embed_dim):
@@ -638,8 +641,9 @@ class RelativeAttention(nn.Module):
         Key i + L of a window is query i itself, so query i reaches the keys i to i + L. All other keys get -inf.
 
         `products` has a row for each query and a column for each distance, L first. Row i has to move right by i. One
-        reshape moves all rows: pad each row with C columns of -inf, join the rows to one line, and cut this line into
-        rows that are one column shorter. Here L = 2 and C = 3; a2 is query a at distance 2, and "." is -inf:
+        reshape, the relative shift of Transformer-XL, moves all rows: pad each row with C columns of -inf, join the
+        rows to one line, and cut this line into rows that are one column shorter. Here L = 2 and C = 3; a2 is query a
+        at distance 2, and "." is -inf:
 
             a2 a1 a0 .  .  .        a2 a1 a0 .  .
             b2 b1 b0 .  .  .   ->   .  b2 b1 b0 .
@@ -715,9 +719,9 @@ class Agent(nn.Module):
 
     A block's memory at step t is what the block received at the steps t - L to t - 1. Before the first step it is m_0.
     A rollout stores the memory as keys and values (`encode_step`). Training stores only m_0. It computes the whole
-    episode again from m_0 with the current weights (`encode`), so gradients flow through the memory. This replaces how
-    lines 10, 11 and 17 keep the memory. Line 10 also stores the action a_t. We leave the action out, because two fully
-    observed states in a row tell which action lay between them.
+    episode again from m_0 with the current weights (`encode`), so gradients flow through the memory, where
+    Transformer-XL stops them. This replaces how lines 10, 11 and 17 keep the memory. Line 10 also stores the action
+    a_t. We leave the action out, because two fully observed states in a row tell which action lay between them.
     """
 
     def __init__(self, args, envs):
@@ -827,7 +831,7 @@ class Batch:
     actions: torch.Tensor  # (T, N, actions)
     logprobs: torch.Tensor  # (T, N)
     rewards: torch.Tensor  # (T, N), scaled
-    critic: torch.Tensor  # (T, N), the critic's output, from which `returns_baseline` makes V
+    critic: torch.Tensor  # (T, N), the critic's output, from which `train` makes V
     alive: torch.Tensor  # (T, N)
     memory: torch.Tensor  # (blocks, N, L, d), m_0
     advantages: torch.Tensor | None = None  # (T, N), set by train
@@ -918,9 +922,9 @@ def explained_variance(prediction, returns, alive):
 def ppo_loss(agent, batch, mb, clip_coef, vf_coef, ent_coef):
     """The loss -L_CLIP + c1 L_VF - c2 H over the living steps of the episodes `mb`, and the means that are logged.
 
-    L_CLIP is Eq. (11). Line 18 prints L_CLIP + c1 L_VF - c2 H. Our sign of L_CLIP raises it where the loss is
-    minimised. L_VF is 1/2 (critic - target)^2. With several processes `runs.total` sums over them: the loss is this
-    process's part of the mean, and what is logged is the whole mean.
+    L_CLIP is Eq. (11), whose epsilon is --clip-coef. Line 18 prints +L_CLIP, which a minimiser would lower. c1 is
+    --vf-coef, c2 --ent-coef. The paper leaves L_VF open; ours is 1/2 (critic - target)^2. With several processes
+    `runs.total` sums over them: the loss is this process's part of the mean, and what is logged is the whole mean.
     """
     alive = batch.alive[:, mb]
     advantages = batch.advantages[:, mb]
@@ -995,11 +999,11 @@ def learning_rate_of(agent, args, progress):
 def linear_fit(x, y, alive):
     """The values (..., G) that a linear regression of y (..., G) on x (..., G, k) predicts, over a group's G episodes.
 
-    Only living episodes count. The regression has a small ridge penalty. An episode's own return is part of its fit.
-    So its residual is smaller by the factor 1 - leverage, and an episode in an extreme state counts less. On average
-    the leverage is (k + 1) / G, so k should be small. It depends on the states of this step and not on the action. So
-    with --gae-lambda 1 the expected policy gradient of a state keeps its direction. Below 1 this holds only
-    approximately. Fits that leave the episode out bring nothing.
+    Only living episodes count. The regression has a small ridge penalty. The leverage of an episode is the weight of
+    its own return in its own fit, so its residual is smaller by the factor 1 - leverage. On average the leverage is at
+    most (k + 1) / G, where k counts the columns that differ, so k should be small. It depends on the states of this
+    step and not on the action. So with --gae-lambda 1 the expected policy gradient of a state keeps its direction.
+    Below 1 this holds only approximately.
     """
     x = x.double()
     y = y.double()[..., None]  # (..., G, 1)
@@ -1029,23 +1033,23 @@ def returns_baseline(batch, gamma, group):
     is larger than the effect of an action. Flights of one start, compared with one another, still show that effect.
 
     Each `group` of neighbouring episodes flew the same start. Their returns from step t on are regressed linearly on
-    their state at step t, the observations that STATE names. The fit is the baseline. Its residuals have a spread at
-    each step, over all flights of all groups. scale^2 is the spread^2 of the step plus (SMALLEST_SPREAD x the mean
-    spread of the steps)^2.
+    their state at step t, the observations that STATE names. The fit is the baseline. Its residuals have a standard
+    deviation, the spread, at each step, over all flights of all groups. scale^2 is the spread^2 of the step plus
+    (SMALLEST_SPREAD x the mean spread of the steps)^2. The critic learns (return - baseline) / scale, of order 1.
 
     RLOO (Kool et al. 2019) takes the mean return of the other samples of a question as the baseline. GRPO (Shao et al.
     2024) takes the mean return of the whole group, and divides by the group's spread. Both have one return for each
-    sample. We have one for each step, so we regress it on the state. Such a baseline is a linear control variate.
+    sample. We have one for each step, so we regress it on the state.
     """
     if group == 1:
         return torch.zeros_like(batch.rewards), torch.ones_like(batch.rewards[:, :1])
     no_values = torch.zeros_like(batch.critic)
-    monte_carlo, _ = gae(batch.rewards, no_values, batch.alive, gamma, 1.0)
+    returns_to_go, _ = gae(batch.rewards, no_values, batch.alive, gamma, 1.0)  # with V = 0 and lambda = 1
     state = batch.obs[..., STATE].unflatten(1, (-1, group))
-    grouped_returns = monte_carlo.unflatten(1, (-1, group))
+    grouped_returns = returns_to_go.unflatten(1, (-1, group))
     alive = batch.alive.unflatten(1, (-1, group))
     baseline = linear_fit(state, grouped_returns, alive).flatten(1)
-    _, variance = moments(monte_carlo - baseline, batch.alive, 1)
+    _, variance = moments(returns_to_go - baseline, batch.alive, 1)
     mean_spread = variance.sqrt().mean()  # steps that no flight reaches count as zeros
     scale = (variance + (SMALLEST_SPREAD * mean_spread) ** 2 + 1e-8).sqrt()
     return baseline, scale
@@ -1075,8 +1079,8 @@ def train(args, agent, average, optimizer, envs, run, gradient=ppo_gradient):
         memory_noise = args.memory_noise.at(progress)
         gae_lambda = args.gae_lambda.at(progress)
         ent_coef = args.ent_coef.at(progress)
-        set_log_std(agent, args, progress)
-        learning_rate = learning_rate_of(agent, args, progress)
+        set_log_std(agent, args, progress)  # ours
+        learning_rate = learning_rate_of(agent, args, progress)  # ours
         optimizer.param_groups[0]["lr"] = learning_rate
         training = curriculum(args, progress)  # ours
 
@@ -1091,7 +1095,7 @@ def train(args, agent, average, optimizer, envs, run, gradient=ppo_gradient):
         advantages, returns = gae(batch.rewards, values, batch.alive, args.gamma, gae_lambda)
         batch.targets = (returns - baseline) / scale
         batch.advantages = advantages
-        if args.norm_adv:
+        if args.norm_adv:  # as in CleanRL
             mean, variance = moments(advantages, batch.alive, (0, 1))
             batch.advantages = (advantages - mean) / (variance.sqrt() + 1e-8)
 
@@ -1102,7 +1106,7 @@ def train(args, agent, average, optimizer, envs, run, gradient=ppo_gradient):
             losses = runs.finite(losses, epoch, minibatch)
             log.append(losses)
             if losses["approx_kl"] > target_kl:
-                break  # this minibatch takes no step and ends the update
+                break  # ours: this minibatch takes no step and ends the update
             optimizer.step()  # line 18
             average.update_parameters(agent)  # ours; evaluation flies the average
 
