@@ -58,6 +58,19 @@ def free_ends(problem: Problem):
     return target, *(np.array(rows[::-1])[:, aims] for rows in (Phi, c, G))
 
 
+def constraints_about_target(problem: Problem):
+    """The constraints (k,) at the target of a problem of one phase, and their slopes (k, n), without control."""
+    n = problem.states
+    target = problem.aim_of(problem.phases[0])
+    h = 2.0**-9
+    points = target[:, None] + h * np.hstack([np.zeros((n, 1)), -np.eye(n), np.eye(n)])
+    control = problem.as_control(np.zeros((problem.controls, 1)))
+    hidden = problem.hidden(np.zeros((1, problem.drawn)))
+    rows = problem.constraints_at(tuple(points), control, hidden)
+    values = np.array([np.broadcast_to(row, 2 * n + 1) for row in rows]).reshape(-1, 2 * n + 1)
+    return values[:, 0], (values[:, n + 1 :] - values[:, 1 : n + 1]) / (2 * h)
+
+
 def riccati(problem: Problem):
     """Finite-horizon discrete LQR by the backward Riccati recursion (e.g. Anderson and Moore, Optimal Control, 1990).
 
