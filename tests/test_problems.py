@@ -869,8 +869,11 @@ def test_a_circular_orbit_is_a_condition(new_problem):
     assert math.hypot(radial, v * math.sqrt(r) - 1) <= 0.001
 
 
-def test_the_control_to_make_up_brings_a_flight_to_its_target():
-    """The rendezvous is linear: held from the fifth impulse on, the control that the policy sees ends at the target."""
+def test_what_a_policy_of_impulses_sees():
+    """The rendezvous is linear: held from the fifth impulse on, the control that it sees ends at the target.
+
+    How far a flight is beyond the sides of the cone is what the table says.
+    """
     problem = PROBLEMS["Rendezvous-v0"]
     batch = gym.make_vec(problem.env_id, num_envs=1).unwrapped
     agent = script.Agent(script.Args(env_id=problem.env_id, num_blocks=0, embed_dim=8, hidden_dim=8), batch)
@@ -883,6 +886,8 @@ def test_the_control_to_make_up_brings_a_flight_to_its_target():
     x0, _ = flights_of_seed(problem, 0, 3)
     end = fly(problem.env_id, policy, x0)["x"][:, -1]
     assert np.linalg.norm(end[:, :3] - [0, -1000, 0], axis=1).max() < 0.1  # m; without it they end up to 60 km away
+    seen = script.excess(agent, torch.as_tensor(np.c_[x0, np.zeros(3)]).float())
+    np.testing.assert_allclose(seen.T, problem.constraints_at(tuple(x0.T), (0, 0, 0), ()), atol=0.01)
 
 
 def least_velocity_change(x0, w):
