@@ -119,6 +119,9 @@ def measured(result, found):
     """What the cells "optimum" and "here" are of, in their order: (values, digits, unit) each."""
     if result in OTHERS:
         return [([1.0], 0, "")], [(found["ratio_of_sums"], 4, ""), (found["ratio_mean"], 4, "")]
+    if result == "rendezvous":
+        here = [(found["nominal_ratio"], 3, ""), (100 * found["hit_rate"], 1, " %")]
+        return [([1.0], 0, "")], [*here, (100 * found["constraints_kept_rate"], 1, " %")]
     if result in LANDERS:
         here = [(100 * found["landed_rate"], 2, " %"), (found["position_error_mean_m"], 2, " m")]
         return [(found["reference_fuel_mean_kg"], 1, " kg")], [*here, (found["fuel_ratio"], 3, "")]
@@ -156,7 +159,7 @@ def test_edits_of_a_script_change_one_line():
         assert len(changed) == 1, f"sed {expression} {script}"
 
 
-@pytest.mark.parametrize("result", [*OTHERS, *ROCKETS, *LANDERS])
+@pytest.mark.parametrize("result", [*OTHERS, *ROCKETS, *LANDERS, "rendezvous"])
 def test_the_front_page_says_what_the_results_hold(result):
     """Medians over the seeds, in order and nothing else; ranges wherever they are given."""
     found, row = seeds_of(result), row_of(result)
