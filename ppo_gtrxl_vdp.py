@@ -170,7 +170,7 @@ OWN = {  # a problem of your own; flights are compared from the first update on,
 }
 OWN_WITH_ONE_START = {**OWN, "total_updates": 1400, "num_envs": 64, "flights_per_start": 64}
 OWN_WITH_STARTS = {**OWN, "total_updates": 150, "num_envs": 256, "flights_per_start": 16}
-OWN_WITH_IMPULSES = {  # a few impulses make a short flight, so there can be many; least fuel has impulses of zero
+OWN_WITH_IMPULSES = {  # a flight of a few impulses is short, so there can be many; little noise lets the others be 0
     **OWN_WITH_STARTS,
     "total_updates": 1400,
     "flights_per_start": 32,
