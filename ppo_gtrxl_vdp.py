@@ -172,11 +172,11 @@ OWN_WITH_ONE_START = {**OWN, "total_updates": 1400, "num_envs": 64, "flights_per
 OWN_WITH_STARTS = {**OWN, "total_updates": 150, "num_envs": 256, "flights_per_start": 16}
 OWN_WITH_IMPULSES = {  # a flight of a few impulses is short, so there can be many; little noise lets the others be 0
     **OWN_WITH_STARTS,
-    "total_updates": 1400,
     "flights_per_start": 32,
     "gae_lambda": 0.9,
     "log_std": "0:-0.7 0.1:-1.7 0.85:-4.6 1:-6",
 }
+STEPS_WITH_IMPULSES = 42_000  # of each environment, in a training
 
 
 def recipe(args):
@@ -185,7 +185,8 @@ def recipe(args):
         return RECIPES[args.env_id]
     problem = PROBLEMS.get(args.env_id)
     if problem and problem.step:
-        return OWN_WITH_IMPULSES
+        updates = max(OWN_WITH_STARTS["total_updates"], STEPS_WITH_IMPULSES // problem.steps)
+        return {**OWN_WITH_IMPULSES, "total_updates": updates}
     if problem and problem.has_one_flight:
         return OWN_WITH_ONE_START
     return OWN_WITH_STARTS
