@@ -276,7 +276,7 @@ def test_the_site_builds_and_holds_every_page(tmp_path):
     for page in [*(ROOT / "docs").rglob("*.md"), ROOT / "CONTRIBUTING.md"]:
         assert (tmp_path / page.relative_to(ROOT)).with_suffix(".html").exists(), page
     front = (tmp_path / "index.html").read_text()
-    assert "results/rocket_cutoff/figures/animation.gif" in front and (tmp_path / "results/di/index.html").exists()
+    assert "results/rocket_failures/figures/animation.gif" in front and (tmp_path / "results/di/index.html").exists()
     styles = re.findall(r'<link rel="stylesheet" href="([^"]+)"', front)
     assert styles and all((tmp_path / style).exists() for style in styles)
     assert not [path for path in tmp_path.rglob("*") if path.suffix in {".npz", ".safetensors", ".csv", ".pt"}]

@@ -232,7 +232,7 @@ def test_reference_needs_no_casadi():
 
 
 def test_unknown_id_is_refused():
-    ids = "RocketAscent-v0, RocketAscentCutoff-v0, RocketAscentAnyOrbit-v0, TwoStageLEO-v0"
+    ids = "RocketAscent-v0, RocketAscentCutoff-v0, RocketAscentAnyOrbit-v0, RocketAscentLowOrbits-v0, TwoStageLEO-v0"
     with pytest.raises(ValueError, match=f"'Rocket-v0'; it must be one of {ids}$"):
         rocket_reference("Rocket-v0")
 
