@@ -216,7 +216,7 @@ def dispersed_figure(rocket: Rocket, flights: dict[str, dict], title: str) -> Fi
         ax.grid(alpha=0.3)
     handles, names = distribution.get_legend_handles_labels()
     handles.append(Line2D([], [], **TARGET))
-    figure.legend(handles, [*names, "a launcher's accuracy"], loc="outside lower center", ncols=min(len(handles), 5))
+    figure.legend(handles, [*names, "a launcher's accuracy"], loc="outside lower center", ncols=min(len(handles), 4))
     figure.suptitle(title)
     return figure
 
