@@ -297,8 +297,8 @@ def linear(inputs, outputs, gain=1.0, bias=0.0):
 class Gate(nn.Module):
     """Eq. (7): gate(x, y) = lambda x + (1 - lambda) y, lambda = sigmoid(W_g [x, y] + b_g), of x and y (..., d).
 
-    With b_g > 0 an untrained gate is near the identity gate(x, y) = x. It is the highway gate of Parisotto et al.
-    (2020), not their GRU gate.
+    With b_g > 0 an untrained gate is near the identity gate(x, y) = x. It resembles the highway gate of Parisotto et
+    al. (2020), where lambda sees x alone, and not their GRU gate.
     """
 
     def __init__(self, embed_dim):

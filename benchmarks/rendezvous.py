@@ -16,7 +16,7 @@ from common.tables import lines_of
 from common.tasks import task_of
 from phased.metrics import KEPT
 from phased.problem import flights_of_seed
-from problems.rendezvous import GREATEST, RENDEZVOUS
+from problems.rendezvous import GREATEST, RENDEZVOUS, impulse
 
 ENV_ID = RENDEZVOUS.env_id
 HEAD = ("", "nominal (m/s)", "draws: mean, σ (m/s)", "mean miss (m)", "within 0.5 m", "within 1 m", "cone kept")
@@ -42,6 +42,15 @@ def row(name: str, nominal: dict, flights: dict) -> tuple[str, ...]:
     return name, alone, f"{change.mean():.3f}, {change.std():.3f}", f"{miss.mean():.3f}", *shares
 
 
+def perfect_law(n: int = 1_000_000) -> tuple[str, ...]:
+    """The row of a law without any error: it misses by what the last step draws, after the last impulse."""
+    w = np.random.default_rng(0).uniform(-1, 1, (3, n)) * np.array(RENDEZVOUS.noise)[:, None]
+    at_rest = (np.zeros(n),) * 6
+    miss = np.linalg.norm(impulse(at_rest, (0, 0, 0), w)[:3], axis=0)
+    shares = [f"{np.mean(miss <= 0.5):.2%}", f"{np.mean(miss <= 1.0):.1%}"]
+    return "a perfect law", "-", "-", f"{miss.mean():.3f}", *shares, "-"
+
+
 def main():
     parser = OneLineParser(description=__doc__.splitlines()[0])
     parser.add_argument("policies", nargs="+", metavar="POLICY", help="agent.safetensors of Rendezvous-v0")
@@ -57,6 +66,7 @@ def main():
         policy = agent.make_policy(RENDEZVOUS.steps)
         nominal = envs.fly(ENV_ID, policy, best["x"][:, 0], **options)
         rows.append(row(path, nominal, envs.fly(ENV_ID, policy, x0, draw, **options)))
+    rows.append(perfect_law())
     print("\n".join(lines_of(rows)))
 
 
