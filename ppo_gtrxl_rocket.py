@@ -184,10 +184,13 @@ FAILING = {  # replaces values of DISPERSED; training begins with a policy of he
     "direct_differences": True,  # a failure makes them large, and the blocks go on wrongly beyond what they have seen
     "mass_weight": "0.1:0 0.2:1 0.5:1 0.85:0",  # so that failed flights burn less
 }
+DISPERSED_TARGETS = {  # replaces values of DISPERSED where every flight has its own target, too
+    "flights_per_start": 8,  # more targets an update teach more than more flights of each
+}
 ANY_ORBIT = {  # replaces values of CUTOFF where every flight has its own target: at first six targets an update
     "total_updates": 400,
     "num_envs": 96,
-    "flights_per_start": "0:16 0.65:16 0.65:8",  # late, more targets an update teach more than more flights of each
+    "flights_per_start": "0:16 0.65:16 0.65:8",  # early, 16 show better what a target's flights are worth
     "num_minibatches": 16,
     "log_std": "0:-1 0.4:-3.5 1:-5.8",  # many orbits need longer at every size of noise
     "mass_weight": "0.1:0 0.2:2 0.7:2 0.95:0",
@@ -236,7 +239,11 @@ def recipe(args, anew=False):
         print(f"{flag}: no policy of {args.env_id} to begin with, so this training begins anew; better {todo}")
         return {**changes, "num_envs": DISPERSED["num_envs"], "flights_per_start": DISPERSED["flights_per_start"]}
     changes = {**changes, **DISPERSED, "checkpoint": first_policy}
-    return {**changes, **FAILING} if args.failure else changes
+    if args.failure:
+        changes |= FAILING
+    if ROCKETS[args.env_id].targets:
+        changes |= DISPERSED_TARGETS
+    return changes
 
 
 # Problem: input and action (features, frame and first action are ours) ------------------------------------------------
