@@ -239,6 +239,8 @@ def try_functions(problem):
         check_tuple(problem, "constraints", problem.constraints, (x, u), p, None)
         allowed = "must be positive with constraints"
         refuse(problem, positive(problem.constraint_price), "constraint_price", problem.constraint_price, allowed)
+    margin = problem.constraint_margin
+    refuse(problem, is_weight(margin), "constraint_margin", margin, "must be a number of at least 0")
 
 
 def check_tuple(problem, field: str, function: Callable, arguments, p, count: int | None) -> int:

@@ -29,6 +29,10 @@ class PhasedTraining(Training):
     radius_scale: float = numeric(1.0)  # factor on the radii in which the reward pays the bonus
     # distance beyond these radii over which the bonus falls linearly to 0 (0: a step)
     bonus_width: float = numeric(0.0)
+    # of the draws of each number of a start, the share that lies at the ends of its range
+    start_ends: float = numeric(0.0, high=0.9)
+    # how far below 0 a constraint must stay: what is above costs
+    constraint_margin: float = numeric(0.0)
 
 
 class PhasedVectorEnv(BatchedEnv):
@@ -202,7 +206,8 @@ class PhasedVectorEnv(BatchedEnv):
         elif callable(problem.x0):
             x0 = np.column_stack([np.broadcast_to(x, count) for x in problem.x0(problem.scores_of(draw))])
         else:
-            x0 = self._draw_starts(lambda n: problem.starts_in_box(self.np_random, n), count)
+            at_ends = self.training.start_ends
+            x0 = self._draw_starts(lambda n: problem.starts_in_box(self.np_random, n, at_ends), count)
         for component, start in zip(self.x, x0.T):
             component[mask] = start
         self.draw[mask] = draw
@@ -299,9 +304,9 @@ class PhasedVectorEnv(BatchedEnv):
 
     def _fly(self, x, u, phase, h):
         """What `flown` returns, by the phase of each environment."""
-        problem, phases = self.problem, self.problem.phases
+        problem, phases, margin = self.problem, self.problem.phases, self.training.constraint_margin
         if self._alike or (phase == phase[0]).all():
-            return flown(problem, phases[phase[0]], x, u, self._parameters, h, self._noise())
+            return flown(problem, phases[phase[0]], x, u, self._parameters, h, self._noise(), margin)
         after = np.empty((problem.states, self.num_envs))
         cost, excess, worst = np.zeros((3, self.num_envs))
         for k in np.unique(phase):
@@ -340,7 +345,8 @@ class PhasedVectorEnv(BatchedEnv):
         u = tuple(value[there] for value in u) if isinstance(u, tuple) else u[there]
         f = problem.with_parameters(phase.f or problem.f, p)
         event = problem.with_parameters(phase.end, p)
-        return lambda x: f(x, u), x, event, lambda h: flown(problem, phase, x, u, p, h, w)
+        margin = self.training.constraint_margin
+        return lambda x: f(x, u), x, event, lambda h: flown(problem, phase, x, u, p, h, w, margin)
 
     def _dip(self, there, phase: Phase, before, u, begin, end):
         """The times (n,) in s at which the event is least in this step, and its values there.
@@ -434,10 +440,10 @@ class PhasedVectorEnv(BatchedEnv):
         return sheet_of(self.problem)
 
 
-def flown(problem: Problem, phase: Phase, x, u, p, h, w=()) -> tuple:
+def flown(problem: Problem, phase: Phase, x, u, p, h, w=(), margin=0.0) -> tuple:
     """(x, running, excess, worst) of a step of h seconds: `Problem.advance` and `Problem.violation`."""
     after, running, points = problem.advance(phase, x, u, p, h, w)
-    return after, running, *problem.violation(x, points, u, p, h)
+    return after, running, *problem.violation(x, points, u, p, h, margin)
 
 
 def end_of_phase(problem: Problem, phase: Phase, x, p):

@@ -94,7 +94,8 @@ class Problem:
     `bounds` are constraints in the optimum. The environment charges `bound_price` for each second at a distance of one
     `x_scale` beyond them. `constraints`(x, u) are numbers that must not be above 0 at the beginning of a step and at
     the end of each of its Runge-Kutta steps; with `step` at the beginning alone, where u acts. The environment charges
-    `constraint_price` for each second of an excess of 1. Both functions take p last.
+    `constraint_price` for each second of an excess of 1. A flight along a limit is off by a little, so our training
+    charges from `constraint_margin` below 0 on. Both functions take p last.
 
     `single_optimum` promises that IPOPT ends in the same optimum from every guess, so the reference tries one guess
     (`guesses` of phased/optimum.py). Without it the reference is the best of several.
@@ -128,6 +129,7 @@ class Problem:
     step: Callable | None = None  # x_next = step(x, u), a tuple of n states, instead of f
     constraints: Callable | None = None  # a tuple of numbers of (x, u), each to be at most 0
     constraint_price: float = 0.0
+    constraint_margin: float = 0.0
     noise: tuple[float, ...] = ()  # half widths of the numbers w that each step draws
 
     def __post_init__(self):
@@ -319,8 +321,9 @@ class Problem:
         """The values of `constraints`, or () without it."""
         return () if self.constraints is None else self.with_parameters(self.constraints, p)(x, u)
 
-    def violation(self, x, points, u, p, h) -> tuple:
-        """(excess, worst) of a step of h seconds from x: the integral of what exceeds 0, and the largest constraint.
+    def violation(self, x, points, u, p, h, margin: float = 0.0) -> tuple:
+        """(excess, worst) of a step of h seconds from x: the integral of what exceeds -`margin`, and the largest
+        constraint.
 
         `points` are those of `advance`. The integral is by the trapezoidal rule; with `step` the excess lasts h.
         Without constraints they are 0 and -inf.
@@ -334,7 +337,7 @@ class Problem:
             shares = [0.5, *[1.0] * (len(points) - 1), 0.5]
         for point, share in zip([x, *points], shares):
             for value in self.constraints_at(point, u, p):
-                excess = excess + share * np.maximum(value, 0.0)
+                excess = excess + share * np.maximum(value + margin, 0.0)
                 worst = np.maximum(worst, value)
         return excess * h / sum(shares), worst
 
@@ -342,11 +345,15 @@ class Problem:
         """Rows u (m, ...) as the table's functions take them: one row, or a tuple of rows."""
         return tuple(u) if isinstance(self.u_max, tuple) else u[0]
 
-    def starts_in_box(self, rng: np.random.Generator, n: int) -> np.ndarray:
-        """n starts (n, states) in the box of a table without a function for them."""
+    def starts_in_box(self, rng: np.random.Generator, n: int, at_ends: float = 0.0) -> np.ndarray:
+        """n starts (n, states) in the box of a table without a function for them.
+
+        A share `at_ends` of the draws of each number lies at an end of its range.
+        """
         centre = np.zeros(self.states) if self.x0 is None else np.array(self.x0, dtype=float)
         half = np.broadcast_to(np.asarray(self.x0_max, dtype=float), self.states)
-        return rng.uniform(centre - half, centre + half, (n, self.states))
+        wider = half / (1 - at_ends)
+        return np.clip(rng.uniform(centre - wider, centre + wider, (n, self.states)), centre - half, centre + half)
 
     def draws(self, rng: np.random.Generator, n: int) -> np.ndarray:
         """n draws (n, `drawn`): the standard scores, then w of each step."""

@@ -14,6 +14,8 @@ from phased.metrics import cost_ratio, flight_metrics, near_origin_metrics, rati
 from phased.problem import Problem, flights_of_seed
 from phased.table import table
 
+INTERIM_STARTS = 100  # of an evaluation during a training
+
 
 @dataclass(frozen=True)
 class PhasedTask(SampledTask):
@@ -83,6 +85,10 @@ class PhasedTask(SampledTask):
         if self.problem.has_one_flight:
             return 10
         return super().default_flights(is_brief)
+
+    def interim_flights(self, n: int, **env_options) -> int:
+        """Fewer where costs are functions: there an optimum takes IPOPT long, and each start's is solved first."""
+        return n if self.problem.weighted else min(n, INTERIM_STARTS)
 
     # --- words and pictures
 

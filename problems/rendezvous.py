@@ -60,6 +60,7 @@ RENDEZVOUS = envs.Problem(
     dt=DT,
     constraints=lambda x, u: tuple(side + EDGE * x[1] for side in (x[0], -x[0], x[2], -x[2])),
     constraint_price=2e-4,
+    constraint_margin=2.0,
     x0=(0.0, -15e3, 0.0, 0.0, 0.0, 0.0),
     x0_max=(1500.0, 1500.0, 75.0, 0.0, 0.0, 0.0),
     x_max=(3e5, 2e6, 3e5, 400.0, 800.0, 400.0),

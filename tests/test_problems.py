@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
@@ -352,7 +353,7 @@ def test_every_table_of_ours_trains_and_is_flown_again(env_id, tmp_path, monkeyp
     (run,) = (tmp_path / "runs").iterdir()
     args, metrics = (json.loads((run / name).read_text()) for name in ("args.json", "eval.json"))
     assert args["flights_per_start"] == 16 and args["env_id"] == env_id
-    assert args["gae_lambda"] == (0.9 if PROBLEMS[env_id].step else 1)
+    assert args["gae_lambda"] == 0.9
     script.main(["--eval-only", f"--checkpoint={run / 'agent.safetensors'}", "--eval-starts=10", "--eval-json=a.json"])
     again = json.loads((tmp_path / "a.json").read_text())
     for part in ("cost_mean", "reference_cost_mean", "hit_rate", "episodic_return"):
@@ -628,6 +629,10 @@ SLIPS = {
     "noise 0": ({"f": None, "step": lambda x, u, w: spring(x, u), "noise": (0.0,)}, "noise"),
     "a step without its noise": ({"f": None, "step": spring, "noise": (0.1,)}, "step of Mine-v0 fails"),
     "constraints without a price": ({"constraints": lambda x, u: (x[0] - 9,)}, "constraint_price"),
+    "a margin below 0": (
+        {"constraints": lambda x, u: (x[0] - 9,), "constraint_price": 1.0, "constraint_margin": -1.0},
+        "constraint_margin",
+    ),
     "a constraint alone": ({"constraints": lambda x, u: x[0] - 9, "constraint_price": 1.0}, "constraints .* a tuple"),
     "conditions without a radius": ({"phases": (Phase(5, conditions=lambda x: (x[0],)),)}, "conditions of phase 1"),
     "a radius too few": (
@@ -761,6 +766,31 @@ def test_a_discrete_limit_is_of_the_state_in_which_the_control_acts(new_problem)
     assert all_at_once["cost_constraints"][0] == pytest.approx(30.0 * problem.dt * (0.5 + 1.0))
 
 
+def test_a_training_charges_from_the_margin_on(new_problem):
+    limit = {"constraints": lambda x, u: (u - x[0],), "constraint_price": 30.0, "constraint_margin": 0.4}
+    table = {"step": lambda x, u: (x[0],), "u_max": 1.0, "phases": (Phase(1, terminal=lambda x: 0.0),), "x_max": (9.0,)}
+    new_problem(Problem("Limit-v0", **table, x0=(1.0,), x0_max=0.0, **limit))
+    training = script.curriculum(script.Args(env_id="Limit-v0"), 0.0)
+    envs = gym.make_vec("Limit-v0", num_envs=3)
+    for options, costs in (({}, [0.0, 0.0, 0.0]), ({"training": training}, [0.0, 0.2, 0.4])):
+        envs.reset(options=options)
+        _, _, _, _, info = envs.step(np.array([[0.5], [0.8], [1.0]]))
+        np.testing.assert_allclose(info["final_info"]["cost"], 30.0 * 0.1 * np.array(costs), atol=1e-12)
+        np.testing.assert_allclose(info["final_info"]["constraint_max"], [-0.5, -0.2, 0.0])
+
+
+def test_a_training_draws_more_starts_at_the_edges(new_problem):
+    new_problem(Problem("Box-v0", spring, 1.0, (PHASE,), (20.0, 20.0), x0=(4.0, 0.0), x0_max=(1.5, 0.0)))
+    envs = gym.make_vec("Box-v0", num_envs=400).unwrapped
+    envs.reset(seed=0, options={"training": script.curriculum(script.Args(env_id="Box-v0"), 0.0)})
+    x = envs.x[0]
+    for edge in (2.5, 5.5):
+        assert 0.06 < np.mean(x == edge) < 0.14
+    inside = x[(x > 2.5) & (x < 5.5)]
+    assert np.std(inside) == pytest.approx(3 / 12**0.5, rel=0.1)
+    assert (envs.x[1] == 0.0).all()
+
+
 def test_a_step_in_closed_form_is_the_same_problem(new_problem):
     """The double integrator's exact step gives the flights and the optimum of its derivatives."""
     h = 0.1
@@ -871,7 +901,7 @@ def test_a_circular_orbit_is_a_condition(new_problem):
 
 
 def test_what_a_policy_of_impulses_sees():
-    """The rendezvous is linear: held from the fifth impulse on, the control that it sees ends at the target.
+    """The rendezvous is linear: of the two controls that it sees, one held to the end and one given once arrive.
 
     How far a flight is beyond the sides of the cone is what the table says.
     """
@@ -880,13 +910,16 @@ def test_what_a_policy_of_impulses_sees():
     agent = script.Agent(script.Args(env_id=problem.env_id, num_blocks=0, embed_dim=8, hidden_dim=8), batch)
     seen = {}
 
-    def policy(obs, t):
-        to_make_up = script.to_make_up(agent, torch.as_tensor(obs).float()).numpy() * problem.u_unit
-        return seen.setdefault("control", to_make_up) if t >= 5 else 0 * to_make_up
+    def policy(steps, column, obs, t):
+        if t == 5:
+            controls = script.to_make_up(agent, torch.as_tensor(obs).float()).numpy()
+            seen[column] = controls[:, column : column + 3] * problem.u_unit
+        return seen[column] if t in steps else np.zeros((len(obs), 3))
 
     x0, _ = flights_of_seed(problem, 0, 3)
-    end = fly(problem.env_id, policy, x0)["x"][:, -1]
-    assert np.linalg.norm(end[:, :3] - [0, -1000, 0], axis=1).max() < 0.1  # m; without it they end up to 60 km away
+    for steps, column in ((range(5, 30), 0), ([5], 3)):
+        end = fly(problem.env_id, partial(policy, steps, column), x0)["x"][:, -1]
+        assert np.linalg.norm(end[:, :3] - [0, -1000, 0], axis=1).max() < 0.1  # m; without it they end 60 km away
     seen = script.excess(agent, torch.as_tensor(np.c_[x0, np.zeros(3)]).float())
     np.testing.assert_allclose(seen.T, problem.constraints_at(tuple(x0.T), (0, 0, 0), ()), atol=0.01)
 
