@@ -15,7 +15,6 @@ class Scene {
     this.renderer.setPixelRatio(window.devicePixelRatio || 1);
     container.appendChild(this.renderer.domElement);
     this.camera = new THREE.PerspectiveCamera(40, 1, 1e-4, 200);
-    this.camera.up.set(0, 0, 1);
     this.world = new THREE.Scene();
     this.earth = this.makeEarth();
     this.world.add(this.earth);
@@ -143,19 +142,25 @@ class Scene {
     const { y } = this.flights.policy;
     const [begin, end] = [unit(y[0]), unit(y[y.length - 1])];
     const middle = unit(sum(begin, end));
-    const span = Math.max(norm(sum(end, scaled(begin, -1))), 0.05);
+    const way = sum(end, scaled(begin, -1));
+    const span = Math.max(norm(way), 0.05);
     const side = scaled(this.rocket.axes[2], -1);
+    const local = { up: middle, level: unit(way) }; // whatever the latitude, the ascent goes up in the picture
+    const eci = { up: [0, 0, 1], level: [1, 0, 0] };
     const places = {
-      ascent: { focus: scaled(middle, 1.01), from: sum(scaled(side, 1.15 * span), scaled(middle, 0.5 * span)) },
-      rocket: { focus: [0, 0, 0], from: sum(scaled(side, 0.06), scaled(middle, 0.035)) },
-      globe: { focus: [0, 0, 0], from: scaled(sum(middle, scaled(side, 0.7)), 3.4) },
-      orbit: { focus: this.orbitCentre(), from: scaled(sum(side, scaled(middle, 0.4)), this.orbitSize()) },
+      ascent: { ...local, focus: scaled(middle, 1.01), from: sum(scaled(side, 1.15 * span), scaled(middle, 0.5 * span)) },
+      rocket: { ...local, focus: [0, 0, 0], from: sum(scaled(side, 0.06), scaled(middle, 0.035)) },
+      globe: { ...eci, focus: [0, 0, 0], from: scaled(sum(middle, scaled(side, 0.7)), 3.4) },
+      orbit: { ...eci, focus: this.orbitCentre(), from: scaled(sum(side, scaled(middle, 0.4)), this.orbitSize()) },
     };
-    const { focus, from } = places[view];
+    const { up, level, focus, from } = places[view];
+    this.axes = [level, cross(up, level), up]; // of azimuth and elevation
+    this.camera.up.set(...up);
     this.focus.set(...focus);
     this.radius = norm(from) * Math.max(1, 1.2 / this.camera.aspect); // further away where the picture is narrow
-    this.azimuth = Math.atan2(from[1], from[0]);
-    this.elevation = Math.asin(from[2] / norm(from));
+    const along = this.axes.map((axis) => dot(axis, from));
+    this.azimuth = Math.atan2(along[1], along[0]);
+    this.elevation = Math.asin(along[2] / norm(from));
     this.render();
   }
 
@@ -206,7 +211,8 @@ class Scene {
       this.focus.copy(this.dots.policy.position);
     }
     const flat = this.radius * Math.cos(this.elevation);
-    const from = [flat * Math.cos(this.azimuth), flat * Math.sin(this.azimuth), this.radius * Math.sin(this.elevation)];
+    const along = [flat * Math.cos(this.azimuth), flat * Math.sin(this.azimuth), this.radius * Math.sin(this.elevation)];
+    const from = sum(...this.axes.map((axis, k) => scaled(axis, along[k])));
     this.camera.position.set(...sum(from, this.focus.toArray()));
     this.camera.lookAt(this.focus);
     for (const [name, dot] of Object.entries(this.dots)) {
