@@ -41,7 +41,7 @@ from common import flags
 from common.schedule import Schedule
 from cuda_graphs import speed_up
 from envs import PROBLEMS, own_ids
-from phased.lqr import constraints_about_target, free_ends
+from phased.lqr import free_ends, next_constraints
 
 
 @dataclass
@@ -216,7 +216,9 @@ def miss_constants(env_id):
     single[:-1] -= push[1:]  # of the control of one step
     gain = -np.hstack([np.linalg.pinv(push), np.linalg.pinv(single)]) / np.tile(problem.u_unit, 2)[:, None]
     buffers = {"target": target, "make_up": gain @ Phi, "drift": (gain @ c[..., None])[..., 0]}
-    buffers["limit"], buffers["limit_slope"] = constraints_about_target(problem)
+    limit, slope, effect = next_constraints(problem)
+    unit = np.where(effect > 0, effect, 1.0)
+    buffers["limit"], buffers["limit_slope"] = limit / unit, slope / unit[:, None]
     return {name: value.tolist() for name, value in buffers.items()}
 
 
@@ -234,21 +236,23 @@ def to_make_up(agent, obs):
 
 
 def excess(agent, obs):
-    """The table's constraints (..., k), linear about the target: how far a flight is beyond each, in its unit. Ours."""
+    """How far beyond each constraint (..., k) this step ends without control, linear about the target. Ours.
+
+    The unit is what an action of 1 changes. A limit that is more than three units away does not matter in this step.
+    """
     distance = obs[..., : len(agent.target)] - agent.target
-    return agent.limit + distance @ agent.limit_slope.mT
+    return (agent.limit + distance @ agent.limit_slope.mT).clamp(min=-3)
 
 
 def features(agent, obs):
     """What the encoder sees of observations (..., obs): in units of their scale, `to_make_up` and `excess` if known.
 
-    asinh shows small values of these in proportion, and large ones by their logarithm. Most of the flight is far from
-    the constraints, so they are divided by ten: inputs of size 1.
+    asinh shows small values of these in proportion, and large ones by their logarithm.
     """
     seen = obs / agent.observation_scale
     if not hasattr(agent, "make_up"):
         return seen
-    return torch.cat([seen, to_make_up(agent, obs).asinh(), excess(agent, obs).asinh() / 10], dim=-1)
+    return torch.cat([seen, to_make_up(agent, obs).asinh(), excess(agent, obs).asinh()], dim=-1)
 
 
 def mean_action(output, action_scale):

@@ -58,17 +58,24 @@ def free_ends(problem: Problem):
     return target, *(np.array(rows[::-1])[:, aims] for rows in (Phi, c, G))
 
 
-def constraints_about_target(problem: Problem):
-    """The constraints (k,) at the target of a problem of one phase, and their slopes (k, n), without control."""
+def next_constraints(problem: Problem):
+    """The constraints after a step without control, linear about the target of a problem of one phase.
+
+    From the state x they are a + b (x - x*). An action of 1 in each control moves them by at most `effect`. Returns a
+    (k,), b (k, n) and `effect` (k,).
+    """
+    (phase,) = problem.phases
     n = problem.states
-    target = problem.aim_of(problem.phases[0])
+    target = problem.aim_of(phase)
     h = 2.0**-9
     points = target[:, None] + h * np.hstack([np.zeros((n, 1)), -np.eye(n), np.eye(n)])
     control = problem.as_control(np.zeros((problem.controls, 1)))
     hidden = problem.hidden(np.zeros((1, problem.drawn)))
     rows = problem.constraints_at(tuple(points), control, hidden)
     values = np.array([np.broadcast_to(row, 2 * n + 1) for row in rows]).reshape(-1, 2 * n + 1)
-    return values[:, 0], (values[:, n + 1 :] - values[:, 1 : n + 1]) / (2 * h)
+    slope = (values[:, n + 1 :] - values[:, 1 : n + 1]) / (2 * h)
+    A, B = linearise(problem, target, phase)
+    return values[:, 0] + slope @ drift_at(problem, phase), slope @ A, np.abs(slope @ B) @ problem.u_unit
 
 
 def riccati(problem: Problem):

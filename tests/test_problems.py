@@ -903,7 +903,7 @@ def test_a_circular_orbit_is_a_condition(new_problem):
 def test_what_a_policy_of_impulses_sees():
     """The rendezvous is linear: of the two controls that it sees, one held to the end and one given once arrive.
 
-    How far a flight is beyond the sides of the cone is what the table says.
+    It also sees how far beyond each side of the cone the next step ends without control, or at most three units inside.
     """
     problem = PROBLEMS["Rendezvous-v0"]
     batch = gym.make_vec(problem.env_id, num_envs=1).unwrapped
@@ -920,8 +920,16 @@ def test_what_a_policy_of_impulses_sees():
     for steps, column in ((range(5, 30), 0), ([5], 3)):
         end = fly(problem.env_id, partial(policy, steps, column), x0)["x"][:, -1]
         assert np.linalg.norm(end[:, :3] - [0, -1000, 0], axis=1).max() < 0.1  # m; without it they end 60 km away
-    seen = script.excess(agent, torch.as_tensor(np.c_[x0, np.zeros(3)]).float())
-    np.testing.assert_allclose(seen.T, problem.constraints_at(tuple(x0.T), (0, 0, 0), ()), atol=0.01)
+
+    def beyond(x, u):
+        return np.array(problem.constraints_at(problem.step(x, u, (0, 0, 0)), (0, 0, 0), ()))
+
+    x = np.array([[-2034.0, -5588.0, 10.0, 0.9, 3.0, 0.0], [100.0, -3000.0, -1050.0, 0.0, 1.0, 0.2]])
+    free = beyond(x.T, (0, 0, 0))
+    unit = sum(abs(beyond(x.T, u) - free) for u in problem.u_unit * np.eye(3))
+    seen = script.excess(agent, torch.as_tensor(np.c_[x, np.zeros(2)]).float())
+    np.testing.assert_allclose(seen.T, np.maximum(free / unit, -3), atol=1e-4)
+    assert ((-3 < seen) & (seen != 0)).any(axis=1).all()
 
 
 def least_velocity_change(x0, w):
