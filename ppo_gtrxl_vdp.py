@@ -295,7 +295,7 @@ def curriculum(args, progress):
     group = round(args.flights_per_start.at(progress))
     training = {"flights_per_start": group}
     problem = PROBLEMS.get(args.env_id)
-    if args.env_id not in RECIPES:
+    if problem and args.env_id not in RECIPES:
         training["start_ends"] = 0.2
         training["constraint_margin"] = problem.constraint_margin
     if problem and problem.circles_count:
