@@ -185,11 +185,15 @@ def test_a_rocket_without_a_policy_is_dispersed_anew(monkeypatch, capsys):
     """A vehicle that somebody registers."""
     for like in ("RocketAscentCutoff-v0", "RocketAscent-v0"):
         monkeypatch.setitem(ROCKET.RECIPES, "Mine-v0", ROCKET.RECIPES[like])
+        monkeypatch.setitem(ROCKET.ROCKETS, "Mine-v0", ROCKET.ROCKETS[like])
         anew = ROCKET.recipe(ROCKET.Args(env_id="Mine-v0", dispersion=1.0))
         assert anew == ROCKET.RECIPES[like] | {"num_envs": 64, "flights_per_start": 16}
         assert "no policy of Mine-v0 to begin with, so this training begins anew" in capsys.readouterr().out
     mine = ROCKET.recipe(ROCKET.Args(env_id="Mine-v0", dispersion=1.0, checkpoint="mine.safetensors"))
     assert mine["checkpoint"] == "mine.safetensors" and mine["log_std"] == ROCKET.DISPERSED["log_std"]
+    assert mine["flights_per_start"] == 16
+    any_orbit = ROCKET.recipe(ROCKET.Args(env_id="RocketAscentAnyOrbit-v0", dispersion=1.0))
+    assert any_orbit["flights_per_start"] == 8  # flights that share a target and a vehicle
 
 
 @pytest.mark.parametrize("script", [DI, ROCKET])
