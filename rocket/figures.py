@@ -212,6 +212,8 @@ def dispersed_figure(rocket: Rocket, flights: dict[str, dict], title: str) -> Fi
         errors = np.sort(np.linalg.norm(arrays["final_error"], axis=1))
         distribution.step(errors, np.arange(1, len(errors) + 1) / len(errors), where="post", label=label)
     distribution.set(xlabel="$\\Vert$error$\\Vert$", ylabel="share of the flights at most that far off", xscale="log")
+    decades = np.log10(distribution.get_xlim())
+    distribution.set_xlim(10 ** np.floor(decades[0]), 10 ** np.ceil(decades[1]))  # else ticks between them have labels
     for ax in figure.axes:
         ax.grid(alpha=0.3)
     handles, names = distribution.get_legend_handles_labels()
