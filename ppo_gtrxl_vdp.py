@@ -225,9 +225,9 @@ def miss_constants(env_id):
 def to_make_up(agent, obs):
     """The controls (..., 2 actions) that would bring the flight to its target, in units of an action. Ours.
 
-    The first is held to the end, the second is given in this step alone. By the dynamics linearised about the target:
-    the zero-effort miss of guidance over what a control still does. They hardly depend on how far the end is, while
-    the distance that matters falls from the way to the circle.
+    The first is held to the end, the second is given in this step alone. Each is the zero-effort miss of guidance over
+    what such a control still does, by the dynamics linearised about the target. The first hardly depends on how far the
+    end is, while the distance that matters falls from the way to the circle.
     """
     n = len(agent.target)
     step = (obs[..., n] * (len(agent.make_up) - 1)).round().long()
