@@ -187,7 +187,7 @@ def costs_figure(problem: Problem, arrays: dict, title: str) -> Figure:
     bins = np.histogram_bin_edges([cost, reference_cost], bins=min(40, max(5, len(cost) // 5)))
     panels["all"].hist(cost, bins, color="tab:red", alpha=0.45, label="policy")
     panels["all"].hist(reference_cost, bins, histtype="step", color="tab:blue", linewidth=1.4, label="optimum")
-    panels["all"].set(xlabel="total cost J", ylabel="starts", title=f"All {len(cost)} starts")
+    panels["all"].set(xlabel="total cost J", ylabel="starts", title=f"{len(cost)} starts")
     plot_bars(panels["total"], cost, reference_cost, "total cost J")
     chosen = comparable(problem, arrays) & (reference_cost != 0)
     ratio = cost_ratio(cost, np.where(chosen, reference_cost, 1.0))
