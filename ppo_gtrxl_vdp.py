@@ -223,7 +223,7 @@ def miss_constants(env_id):
 
 
 def to_make_up(agent, obs):
-    """The controls (..., 2 actions) that would bring the flight to its target, in units of an action. Ours.
+    """The controls (..., 2 actions) that would bring the flight to its target, in units of `u_scale`. Ours.
 
     The first is held to the end, the second is given in this step alone. Each is the zero-effort miss of guidance over
     what such a control still does, by the dynamics linearised about the target. The first hardly depends on how far the
@@ -238,16 +238,18 @@ def to_make_up(agent, obs):
 def excess(agent, obs):
     """How far beyond each constraint (..., k) this step ends without control, linear about the target. Ours.
 
-    The unit is what an action of 1 changes. A limit that is more than three units away does not matter in this step.
+    The unit is what controls of `u_scale` change. A limit that is more than ten units away does not matter in this
+    step.
     """
     distance = obs[..., : len(agent.target)] - agent.target
-    return (agent.limit + distance @ agent.limit_slope.mT).clamp(min=-3)
+    return (agent.limit + distance @ agent.limit_slope.mT).clamp(min=-10)
 
 
 def features(agent, obs):
     """What the encoder sees of observations (..., obs): in units of their scale, `to_make_up` and `excess` if known.
 
-    asinh shows small values of these in proportion, and large ones by their logarithm.
+    asinh shows small values of these in proportion, and large ones by their logarithm. Actions have the same scale
+    (`Problem.control_of`), so the single impulse that would hit is an action.
     """
     seen = obs / agent.observation_scale
     if not hasattr(agent, "make_up"):

@@ -51,7 +51,8 @@ def interface(
         notes += f"Hidden in training, give 0: {', '.join(hidden)}. "
     low, high = problem.u_box.tolist()
     if scaled_action:
-        notes += f"Control: {problem.u_centre.tolist()} + {problem.u_unit.tolist()} x action, "
+        action = "sinh(action)" if problem.step else "action"
+        notes += f"Control: {problem.u_centre.tolist()} + {problem.u_unit.tolist()} x {action}, "
     else:
         notes += "Control: the action, "
     bound = f"within {low} to {high}" if problem.u_norm is None else f"its norm within {list(problem.u_norm)}"

@@ -66,7 +66,8 @@ class PhasedVectorEnv(BatchedEnv):
 
     `observe_phase=False` shows tau and phi as 0, and `observe_velocity=False` the velocities. `observe_draw` adds the
     standard scores to the observation. With `scaled_action`, which our scripts use, an action of 0 is the middle of the
-    set of controls, and an action of 1 is `Problem.u_unit` more.
+    set of controls, and an action of 1 is `Problem.u_unit` more. With `step` it is sinh(1) as much
+    (`Problem.control_of`).
 
     `reset(options={"x0": x})` sets the starts x (N, n). `{"draw": z}` sets the scores and the numbers of every
     step, z (N, `Problem.drawn`). `{"training": {...}}` hands over fields of `PhasedTraining`. Raises BadInput for
@@ -96,8 +97,7 @@ class PhasedVectorEnv(BatchedEnv):
         refuse_unless(observe_velocity or problem.hidden_velocities, "observe_velocity", observe_velocity, allowed)
         allowed = "needs `scores` in the table, which it shows"
         refuse_unless(problem.scores or not observe_draw, "observe_draw", observe_draw, allowed)
-        self._centre, self._unit = problem.u_centre, problem.u_unit
-        action_box = (problem.u_box - self._centre) / self._unit if scaled_action else problem.u_box
+        action_box = problem.scaled(problem.u_box) if scaled_action else problem.u_box
         spaces = Box(*self._observation_box(), dtype=np.float64), Box(*action_box, dtype=np.float64)
         super().__init__(num_envs, problem.steps, *spaces, render_mode, autoreset_mode)
         self._tabulate()
@@ -241,7 +241,7 @@ class PhasedVectorEnv(BatchedEnv):
     def _applied(self, actions):
         """The controls (m, N) that actions (N, m) apply."""
         problem = self.problem
-        u = (actions * self._unit + self._centre if self.scaled_action else actions).T
+        u = (problem.control_of(actions) if self.scaled_action else actions).T
         if problem.u_norm is None:
             return np.clip(u, self._low, self._high)
         norm = np.sqrt((u * u).sum(axis=0))

@@ -115,7 +115,7 @@ class Problem:
     guess: Callable | None = None  # u = guess(x), a feedback law whose flight is one more guess at the optimum
     u_min: float | tuple[float, ...] | None = None  # None: -u_max
     u_norm: tuple[float, float] | None = None  # least and greatest norm of the control vector
-    u_scale: float | None = None  # the control of a scaled action of 1; None: half the width of the set of controls
+    u_scale: float | None = None  # the unit of scaled actions (`control_of`); None: half the width of the controls
     x0: tuple[float, ...] | Callable | None = None  # centre of the box (None: the origin), or a function of z
     scores: int = 0  # number of standard scores z
     parameters: Callable | None = None  # hidden parameters of z
@@ -200,9 +200,24 @@ class Problem:
 
     @property
     def u_unit(self) -> np.ndarray:
-        """The control (m,) that a scaled action of 1 adds to the middle: `u_scale`, or half the width."""
+        """The unit (m,) of scaled actions, `control_of`: `u_scale`, or half the width of the set of controls."""
         low, high = self.u_box
         return (high - low) / 2 if self.u_scale is None else np.full(self.controls, self.u_scale)
+
+    def control_of(self, action: np.ndarray) -> np.ndarray:
+        """The controls (..., m), not clipped, that scaled actions (..., m) mean.
+
+        With `step` the scale is linear for controls below `u_unit` and logarithmic above it. The impulses of one flight
+        can differ by a factor of a thousand. On this scale an error of the policy is small for a small impulse.
+        """
+        if self.step:
+            action = np.sinh(np.clip(action, -50, 50))  # beyond it sinh would overflow
+        return action * self.u_unit + self.u_centre
+
+    def scaled(self, u: np.ndarray) -> np.ndarray:
+        """The scaled actions (..., m) that mean the controls u (..., m)."""
+        action = (u - self.u_centre) / self.u_unit
+        return np.arcsinh(action) if self.step else action
 
     @property
     def scale(self) -> np.ndarray:

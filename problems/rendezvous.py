@@ -46,7 +46,7 @@ RENDEZVOUS = envs.Problem(
     noise=(1e-5, 1e-5, 5e-7),  # m/s^2
     u_max=(1.0, 1.0, 1.0),
     u_norm=(0.0, 1.0),
-    u_scale=0.06,  # 0.3 m/s
+    u_scale=0.02,  # 0.1 m/s
     phases=(
         envs.Phase(
             steps=30,
@@ -60,7 +60,7 @@ RENDEZVOUS = envs.Problem(
     dt=DT,
     constraints=lambda x, u: tuple(side + EDGE * x[1] for side in (x[0], -x[0], x[2], -x[2])),
     constraint_price=2e-4,
-    constraint_margin=2.0,
+    constraint_margin=3.0,
     x0=(0.0, -15e3, 0.0, 0.0, 0.0, 0.0),
     x0_max=(1500.0, 1500.0, 75.0, 0.0, 0.0, 0.0),
     x_max=(3e5, 2e6, 3e5, 400.0, 800.0, 400.0),
